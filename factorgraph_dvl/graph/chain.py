@@ -188,7 +188,7 @@ class Chain(Protocol):
         """Return what is assumed of each of these sources, as text."""
 
     def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Any]
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> ImuErrors | None:
         """Return the errors of the IMU among parameters, None if there are none."""
 
@@ -209,16 +209,10 @@ class Chain(Protocol):
             attitude do, and those that move with the nodes.
         """
 
-    def later(self, at: Any, late: Array, shift: float = 0.0) -> Any:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-
-    def left(self, at: Any, late: Array, tolerance: float) -> bool:
-        """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
-
     def missing(self, at: Any, lin: Linearization) -> Array:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
-        Where the motion between nodes is not recorded.
+        Where the motion between nodes is not recorded, or recorded with noise.
         """
 
     def motion(self, at: Any, states: Any) -> Motion:

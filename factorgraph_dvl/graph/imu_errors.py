@@ -7,27 +7,27 @@ with the errors, so the errors get columns of their own in the linear factors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.propagation import Attachment, Transition
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
+    backward,
     by_errors,
     corrected,
     elements,
-    moved,
     predicted,
     sensitivities,
 )
+from factorgraph_dvl.imu.two_way import TwoWay, TwoWayTransition
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -54,6 +54,14 @@ class LinearImuFactors:
     more_cost: float
 
 
+@dataclass(frozen=True)
+class TwoWaySensitivity:
+    """How what is integrated up to M times from both nodes moves with the errors."""
+
+    forward: Sensitivity
+    backward: Sensitivity
+
+
 class ImuErrors:
     """Errors of the IMU in a graph.
 
@@ -65,8 +73,6 @@ class ImuErrors:
         Errors that are estimated.
     keys : sequence of int
         Their keys.
-    attachments : sequence of Attachment
-        Where measurements hang on the chain.
     """
 
     def __init__(
@@ -74,48 +80,69 @@ class ImuErrors:
         segments: Segments,
         parameters: Sequence[Parameter],
         keys: Sequence[int],
-        attachments: Sequence[Attachment],
     ) -> None:
         self.names = tuple(p.name for p in parameters)
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
-        self._segments = segments
+        self._segments, self._parameters = segments, tuple(parameters)
         self._elements = elements(parameters)
-        unique = {id(at): at for at in attachments}
-        whole, found = sensitivities(segments, self._elements, list(unique.values()))
-        self._whole = whole
-        self._ends = predicted(segments, whole)
-        self._by: dict[int, Sensitivity] = dict(zip(unique, found, strict=True))
+        self._whole: Sensitivity | None = None
+        # By identity of the attachment, which is kept with it.
+        self._by: dict[int, tuple[TwoWay, TwoWaySensitivity]] = {}
         self._factors: list[gtsam.JacobianFactor] = []
+
+    def of_part(self, segments: Segments) -> ImuErrors:
+        """Return the same errors where the chain has some of its segments."""
+        return ImuErrors(segments, self._parameters, self._keys)
 
     def vector(self, parameters: Mapping[str, Array]) -> Array:
         """Return the errors among parameters, (n,), SI."""
         return np.concatenate([parameters[name] for name in self.names])
 
-    def corrected(self, at: Attachment, bound: Attachment, errors: Array) -> Attachment:
-        """Return an attachment without the errors; `bound` is where it was bound."""
-        by = self._by[id(bound)]
-        if at is not bound:
-            by = moved(self._segments, at, bound, by, self._whole)
-        return self.without(at, by, errors)
+    def attach(self, attachments: Sequence[TwoWay]) -> None:
+        """Find how what is integrated up to attached times moves, and keep it for no others."""
+        known = {id(at): self._by.get(id(at)) for at in attachments}
+        new = [at for at in attachments if known[id(at)] is None]
+        unique = list({id(at): at for at in new}.values())
+        if unique or self._whole is None:
+            self._whole, found = sensitivities(
+                self._segments, self._elements, [at.forward for at in unique]
+            )
+            for at, forward in zip(unique, found, strict=True):
+                of_ends = rows_of(self._whole, at.segment)
+                both = TwoWaySensitivity(forward, backward(self._segments, at, forward, of_ends))
+                known[id(at)] = at, both
+        self._by = {key: each for key, each in known.items() if each is not None}
 
-    def without(self, at: Attachment, by: Sensitivity, errors: Array) -> Attachment:
+    @cached_property
+    def _ends(self) -> Array:
+        """Derivatives of the predicted states at the ends of segments, (S, 9, n)."""
+        if self._whole is None:
+            self.attach(())
+        assert self._whole is not None
+        return predicted(self._segments, self._whole)
+
+    def sensitivity(self, at: TwoWay) -> TwoWaySensitivity:
+        """Return how what is integrated up to attached times moves with the errors."""
+        return self._by[id(at)][1]
+
+    def without(self, at: TwoWay, by: TwoWaySensitivity, errors: Array) -> TwoWay:
         """Return an attachment without the errors (n,), which move it by its sensitivity."""
-        return corrected(at, by, self._elements, errors)
+        return replace(
+            at,
+            forward=corrected(at.forward, by.forward, self._elements, errors),
+            backward=corrected(at.backward, by.backward, self._elements, errors),
+        )
 
     def columns(
-        self, lin: Linearization, transition: Transition, by: Sensitivity
+        self, lin: Linearization, transition: TwoWayTransition, by: TwoWaySensitivity
     ) -> dict[str, Array]:
         """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
-        every = by_errors(lin, transition, by, self._elements)
+        share = transition.at.share[:, None, None]
+        every = (1.0 - share) * by_errors(lin, transition.forward, by.forward, self._elements)
+        every += share * by_errors(lin, transition.backward, by.backward, self._elements)
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
-
-    def at(self, attachment: Attachment, bound: Attachment) -> ImuErrors:
-        """Return the errors where measurements at `bound` have another attachment."""
-        out = copy(self)
-        out._by = {**self._by, id(attachment): self._by[id(bound)]}
-        return out
 
     def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
         """Return native factors with what errors (n,) change in those of the IMU.
@@ -131,16 +158,6 @@ class ImuErrors:
         more_cost = 0.5 * float(np.sum(change * (change - 2.0 * rhs)))
         jacobian = np.concatenate([whole[:, :, :-1], columns], axis=2)
         return LinearImuFactors(native, jacobian, rhs - change, more_cost)
-
-    def sensitivity(self, bound: Attachment) -> Sensitivity:
-        """Return how what is integrated up to measurements moves with the errors."""
-        return self._by[id(bound)]
-
-    def of_rows(self, bound: Attachment, rows: Attachment, some: IntArray) -> ImuErrors:
-        """Return the same for some measurements (K,) of those that are bound, with `rows`."""
-        out = copy(self)
-        out._by = {id(rows): rows_of(self._by[id(bound)], some)}
-        return out
 
     def factors(self, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
         """Return the IMU factors, which a graph begins with, as they depend on the errors."""

@@ -1,4 +1,4 @@
-"""Derivatives of measurements by the node before them, through the motion in between."""
+"""Derivatives of measurements by the nodes around them, through the motion in between."""
 
 from __future__ import annotations
 
@@ -7,7 +7,23 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.imu.propagation import Transition, attitude_jacobian
+from factorgraph_dvl.imu.two_way import TwoWayTransition
 from factorgraph_dvl.sensors.protocol import Linearization
+
+
+def two_way_jacobian(lin: Linearization, transition: TwoWayTransition, *, walking: bool) -> Array:
+    """Return the derivative of residuals by the nodes before and after, (M, d, 24 or 30).
+
+    Columns: state and bias as of `node_jacobian`, then the state at the node after and, of biases
+    that walk, that one's too.
+    """
+    share = transition.at.share[:, None, None]
+    before = (1.0 - share) * node_jacobian(lin, transition.forward)
+    after = share * node_jacobian(lin, transition.backward)
+    if walking:
+        return np.concatenate([before, after], axis=2)
+    before[:, :, STATE_SIZE:] += after[:, :, STATE_SIZE:]
+    return np.concatenate([before, after[:, :, :STATE_SIZE]], axis=2)
 
 
 def node_jacobian(lin: Linearization, transition: Transition) -> Array:

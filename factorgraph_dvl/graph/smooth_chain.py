@@ -263,14 +263,6 @@ class SmoothChain:
         node = np.clip(node, 0, self.count - 1)
         return Attached(node, node, time, turned)
 
-    def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return replace(at, time=at.time + late, turned=at.time + late + shift)
-
-    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
-        """Return False: where measurements are between nodes is followed."""
-        return False
-
     def missing(self, at: Attached, lin: Linearization) -> Array:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
@@ -336,9 +328,7 @@ class SmoothChain:
         """Yield nothing: it has no parameters of its own."""
         yield from ()
 
-    def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attached]
-    ) -> None:
+    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
         """Return None: there is no IMU."""
 
     def trajectory(

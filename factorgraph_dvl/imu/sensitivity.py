@@ -19,6 +19,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
+from factorgraph_dvl.imu.two_way import TwoWay
 from factorgraph_dvl.sensors.imu import ERRORS, ImuError
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
@@ -144,47 +145,31 @@ def predicted(seg: Segments, ends: Sensitivity) -> Array:
     return np.concatenate([back @ ends.theta, back @ ends.p, back @ ends.v], axis=1)
 
 
-def moved(
-    seg: Segments,
-    at: Attachment,
-    bound: Attachment,
-    by: Sensitivity,
-    ends: Sensitivity,
-) -> Sensitivity:
-    """Return the sensitivity at M times that a clock has moved.
+def backward(seg: Segments, at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sensitivity:
+    """Return the sensitivity at M times of what is integrated back from the nodes after.
 
-    What is integrated is interpolated between the start of the segment, the time where a
-    measurement was bound if that is in the same segment, and the end. So it does not jump where
-    a measurement moves into the segment before or after.
+    With increments dR_b = dR_Tᵀ dR, dV_b = dR_Tᵀ (dV - dV_T) and dP_b likewise, all of those up
+    to the ends T moving with the errors as well.
 
     Parameters
     ----------
     seg : Segments
         Increments between the nodes.
-    at, bound : Attachment
-        Where the measurements are, and where they were bound.
-    by : Sensitivity
-        Where they were bound.
-    ends : Sensitivity
-        Of the increments over whole segments.
+    at : TwoWay
+        Where the times hang on the chain.
+    forward, ends : Sensitivity
+        Of what is integrated up to the times, and up to the ends of their segments.
     """
-    length = seg.increments.end[seg.last - 1] - seg.node_time[seg.origin]
-    whole = length[at.segment]
-    same = at.segment == bound.segment
-    knot = np.where(same, bound.tau, 0.0)
-    last = _share(at.tau - knot, whole - knot)
-    own = np.where(at.tau < knot, _share(at.tau, knot), 1.0 - last) * same
-    theta, v, p = (
-        own[:, None, None] * here + last[:, None, None] * end[at.segment]
-        for here, end in ((by.theta, ends.theta), (by.v, ends.v), (by.p, ends.p))
+    back = seg.ends.dR[at.segment].transpose(0, 2, 1)
+    tau = at.backward.tau[:, None, None]
+    turned = back @ ends.theta
+    return Sensitivity(
+        theta=back @ (forward.theta - ends.theta),
+        v=back @ (forward.v - ends.v) + skew(at.backward.dV) @ turned,
+        p=back @ (forward.p - ends.p - ends.v * tau) + skew(at.backward.dP) @ turned,
+        gyro=forward.gyro,
+        force=forward.force,
     )
-    return Sensitivity(theta, v, p, at.gyro, at.force)
-
-
-def _share(part: Array, whole: Array) -> Array:
-    """Return how much of a whole a part is, 0 to 1; 1 of nothing."""
-    share = np.divide(part, whole, out=np.ones_like(part), where=whole > 0.0)
-    return np.clip(share, 0.0, 1.0)
 
 
 def corrected(

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
-from factorgraph_dvl.graph.bound_observation import EXTRAPOLATED
 from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
@@ -65,7 +64,6 @@ _ROUGHLY = 1e-2
 # What of a problem changes without a new one.
 _NOISE = message("not_converged.noise")
 _OUTLIERS = message("not_converged.outliers")
-_TIMES = message("not_converged.times")
 _CORRELATED = message("not_converged.correlated")
 _KNOWN = message("not_converged.known")
 _WALKS = message("not_converged.walks")
@@ -77,15 +75,6 @@ _MOST_FREED = 2
 # Relative change of the noise over a long time, by that of innovations, from which on it counts.
 # Chosen: less changes no σ that is shown.
 _SAME_INNOVATIONS = 0.05
-# Bindings in a row after which clocks need not settle closer than the motion is extrapolated, or
-# than a share of their standard deviation. Chosen: most trials take one or two.
-_IN_A_ROW = 4
-# That share. Chosen: a tenth of the variance. Noise of the IMU's samples may give the cost a bend
-# within it, from where two bindings lead to each other.
-_SETTLED_SHARE = 0.3
-# Share of the last movement of the clocks from which on the next binding is half-way. Chosen: half
-# is what is left of a movement after one that went half the way.
-_NOT_SETTLING = 0.75
 # Variance of the scores, beside that of white noise, that a change may leave to explain what looks
 # like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
 _MOST_SCATTER = 20.0
@@ -178,23 +167,14 @@ def settle(
     first_levels = _NoiseLevels((as_stated,), bool(as_stated), processes=stated)
     levels = first_levels
     changing = [message("not_converged.all")]
-    tolerance: Mapping[str, float] = {}
-    count = in_a_row = fruitless = 0
-    movement = np.inf
-    bound = values
+    count = fruitless = 0
     while count < _ROUNDS and fruitless < _FRUITLESS:
-        only_times = changing == [_TIMES]
-        before = movement
-        movement = _clock_movement(prepared, bound, values) if only_times else np.inf
         if changing not in ([_NOISE], [_OUTLIERS]):
-            # Where sway repeats itself, two bindings may lead to each other for ever.
-            settling = not only_times or movement < _NOT_SETTLING * before
-            bound = values if settling else values | _halfway(prepared, bound, values)
             problem = Problem(
                 chain,
                 prepared.observations,
                 parameters,
-                start=bound,
+                start=values,
                 constants_prior=constants_prior,
                 clock_zero=clock_zero,
                 processes=levels.processes,
@@ -206,10 +186,8 @@ def settle(
         problem.noise_factors = levels.factors[-1]
         problem.long_run = long_run
         problem.robust_weights = robust
-        in_a_row = in_a_row + 1 if only_times else 0
-        problem.clock_tolerance = tolerance
-        # At the ends of the record two bindings may use one measurement in turn.
-        usable = problem.usable if tolerance else None
+        # At the ends of the record two rounds may use one measurement in turn.
+        usable = problem.usable if count else None
         at = problem.values(states, problem.prior_values() | values)
         roughly = chain.interpolates and motion < _MOTION_ROUNDS
         minimum = minimise(
@@ -217,7 +195,6 @@ def settle(
             at,
             stage="all sensors",
             progress=report,
-            binding=True,
             proven=not roughly,
             tolerance=_ROUGHLY if roughly else CONVERGED,
         )
@@ -225,8 +202,6 @@ def settle(
         fruitless = 0 if minimum.converged else fruitless + minimum.iterations
         states, values = minimum.evaluation.states, minimum.evaluation.parameters
         changing = _changing(problem, minimum.evaluation)
-        if changing == [_TIMES] and in_a_row >= _IN_A_ROW and not tolerance:
-            tolerance = _clock_tolerance(prepared, problem, minimum.evaluation)
         strengths = None
         if motion < _MOTION_ROUNDS:
             strengths = last_strengths = prepared.strengths(problem, minimum, last_strengths)
@@ -285,7 +260,6 @@ def settle(
                 p.label for p in levels.processes
             }:
                 changing.append(_CORRELATED)
-                tolerance = {}
                 long_run = found.long_run
                 white = levels.factors[-1] | found.factors
                 processes = _with_others(levels.processes, found.processes)
@@ -306,7 +280,7 @@ def settle(
                 )
                 # With another model, all that its misfit made is to be found anew.
                 changing.append(_KNOWN)
-                robust, long_run, levels, tolerance = {}, {}, first_levels, {}
+                robust, long_run, levels = {}, {}, first_levels
                 if tilt is not None:
                     free = tuple(p for p in parameters if p.estimated)
                     tilt = tilt.of(problem.parameters, free)
@@ -334,7 +308,7 @@ def settle(
                 states, values = walks.evaluation.states, walks.evaluation.parameters
                 chain, p_gravity = prepared.chain(states), states.p_n
                 changing.append(_WALKS)
-                robust, long_run, levels, tolerance = {}, {}, first_levels, {}
+                robust, long_run, levels = {}, {}, first_levels
                 searches, correlation_searched, count = 0, False, 0
                 tested = None
         if not changing:
@@ -448,48 +422,8 @@ def _counts(problem: Problem, found: VarianceComponents, process: Process) -> bo
 
 def _changing(problem: Problem, evaluation: Evaluation) -> list[Message]:
     """Return what of the measurements would differ in a problem that starts here."""
-    found = {
-        _TIMES: problem.needs_rebinding(evaluation.parameters),
-        message("not_converged.weights"): problem.needs_reweighting(evaluation),
-    }
-    return [name for name, changed in found.items() if changed]
-
-
-def _clock_tolerance(
-    prepared: Prepared, problem: Problem, evaluation: Evaluation
-) -> dict[str, float]:
-    """Return how closely clocks are to settle, s, by the names of their offsets."""
-    names = {o.clock.names[0] for o in prepared.observations if o.clock is not None}
-    keys = {p.name: problem.key(p.name) for p in problem.parameters if p.name in names}
-    marginals = factorized(problem, evaluation)[0].marginals(list(keys.values()))
-    return {
-        name: max(EXTRAPOLATED, _SETTLED_SHARE * float(np.sqrt(marginals[key][0, 0])))
-        for name, key in keys.items()
-    }
-
-
-def _halfway(
-    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
-) -> dict[str, Array]:
-    """Return offsets and rates of clocks half-way between two sets of values."""
-    names = _clock_parameters(prepared, before, after)
-    return {name: 0.5 * (before[name] + after[name]) for name in names}
-
-
-def _clock_movement(
-    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
-) -> float:
-    """Return the largest change of an offset, s, or of a rate between two sets of values."""
-    names = _clock_parameters(prepared, before, after)
-    return max((float(np.abs(after[n] - before[n]).max()) for n in names), default=0.0)
-
-
-def _clock_parameters(
-    prepared: Prepared, before: Mapping[str, Array], after: Mapping[str, Array]
-) -> list[str]:
-    """Return the names of offsets and rates of clocks that both sets of values have."""
-    clocks = [o.clock for o in prepared.observations if o.clock is not None]
-    return [n for clock in clocks for n in clock.names if n in before and n in after]
+    changed = problem.needs_reweighting(evaluation)
+    return [message("not_converged.weights")] if changed else []
 
 
 def _cycle(

@@ -119,8 +119,8 @@ def log_determinant_gradient(
     """Return the gradient (P,) of log det of the states' information by the constants.
 
     At fixed states and weights, in the tangent space of the estimated parameters, SI, in the
-    order of `Problem.columns`. Zero by clocks where the motion is interpolated: it would be that
-    of the places of measurements between nodes, which mean nothing.
+    order of `Problem.columns`. Zero by clocks: it would be that of the places of measurements
+    between nodes, which mean nothing.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def log_determinant_gradient(
 
     clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
-        if problem.chain.interpolates and p.name in clocks:
+        if p.name in clocks:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
         before = total(p, value)
