@@ -172,15 +172,14 @@ class BoundObservation:
     ) -> Array | None:
         """Return what the motion between nodes adds to the variance of measurements, (M, d).
 
-        None for attitudes, which hardly change by it.
+        None where that is nothing.
         """
         if not self._sees_motion:
             return None
         lin = self.linearized(motion, parameters, (), processes)
-        self._sees_motion = any(by is not None for by in (lin.d_p, lin.d_v, lin.d_omega))
-        if not self._sees_motion:
-            return None
-        return self.chain.missing(at, lin)
+        missing = self.chain.missing(at, lin)
+        self._sees_motion = missing is not None
+        return missing
 
     def values(self, parameters: Mapping[str, Array], processes: Processes) -> Mapping[str, Array]:
         """Return the parameters that measurements see: what varies has a value for each."""

@@ -209,9 +209,10 @@ class Chain(Protocol):
             attitude do, and those that move with the nodes.
         """
 
-    def missing(self, at: Any, lin: Linearization) -> Array:
+    def missing(self, at: Any, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
+        None where these measurements are of nothing that varies between nodes.
         Where the motion between nodes is not recorded, or recorded with noise.
         """
 

@@ -231,20 +231,18 @@ class InertialChain:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         return attach_two_way(self.segments, time, self.frame.earth_rate)
 
-    def missing(self, at: TwoWay, lin: Linearization) -> Array:
+    def missing(self, at: TwoWay, lin: Linearization) -> Array | None:
         """Return the variance (M, d) that noise of the IMU leaves of what is predicted.
 
-        Of attitude and velocity; in a position it is below a millimetre.
+        None for positions and attitudes: it is below a millimetre there, and below the noise of
+        the gyro over a second.
         """
-        between = noise_between(at)[:, None]
-        out = np.zeros_like(lin.residual)
-        for jacobian, density in (
-            (lin.d_theta, self.imu.gyro_noise_root_psd),
-            (lin.d_v, self.imu.accel_noise_root_psd),
-        ):
-            if jacobian is not None:
-                out += density**2 * between * np.sum(jacobian**2, axis=2)
-        return out
+        if lin.d_v is None:
+            return None
+        out = self.imu.accel_noise_root_psd**2 * np.sum(lin.d_v**2, axis=2)
+        if lin.d_theta is not None:
+            out = out + self.imu.gyro_noise_root_psd**2 * np.sum(lin.d_theta**2, axis=2)
+        return noise_between(at)[:, None] * out
 
     def motion(self, at: TwoWay, states: States) -> Motion:
         """Return the motion at M attached times, carried from the nodes on both sides."""

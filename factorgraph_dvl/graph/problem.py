@@ -358,8 +358,10 @@ class Problem:
         )
 
     def _attached_at(self, parameters: dict[str, Array]) -> list[Any]:
-        """Return where observations hang on the chain; those at the same times, and turning alike,
-        have the same attachment, and keep it for as long as no clock moves them."""
+        """Return where observations hang on the chain.
+
+        Those at the same times have the same attachment, until a clock moves them.
+        """
         shift = self.chain.shift(parameters)
         found: dict[Hashable, Any] = {}
         out = []

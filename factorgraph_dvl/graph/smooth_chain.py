@@ -263,11 +263,14 @@ class SmoothChain:
         node = np.clip(node, 0, self.count - 1)
         return Attached(node, node, time, turned)
 
-    def missing(self, at: Attached, lin: Linearization) -> Array:
+    def missing(self, at: Attached, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
         Without it, a measurement would count for more the nearer to a node, and so draw clocks.
+        None for attitudes, by which the motion is known.
         """
+        if lin.d_p is None and lin.d_v is None and lin.d_omega is None:
+            return None
         begin, span = self.node_time[at.node], np.diff(self.node_time)[at.node]
         density, axes = self.density[at.node], self.nRt[at.node]
         out = np.zeros_like(lin.residual)

@@ -222,7 +222,8 @@ class Transition:
         return self.at.turn @ self.states.nRb[self.at.node]
 
     @cached_property
-    def _increments(self) -> tuple[Array, Array, Array]:
+    def moved(self) -> tuple[Array, Array, Array]:
+        """Increments without what biases add, as of `with_bias`."""
         return self.increments or with_bias(self.at, self.states)
 
     @cached_property
@@ -236,7 +237,7 @@ class Transition:
     @cached_property
     def theta_theta(self) -> Array:
         """Attitude by attitude, (M, 3, 3)."""
-        return self._increments[0].transpose(0, 2, 1)
+        return self.moved[0].transpose(0, 2, 1)
 
     @cached_property
     def theta_gyro(self) -> Array:
@@ -251,7 +252,7 @@ class Transition:
     @cached_property
     def p_theta(self) -> Array:
         """Position by attitude."""
-        return -self.turned @ skew(self._increments[2])
+        return -self.turned @ skew(self.moved[2])
 
     @cached_property
     def p_p(self) -> Array:
@@ -277,7 +278,7 @@ class Transition:
     @cached_property
     def v_theta(self) -> Array:
         """Velocity by attitude."""
-        return -self.turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
+        return -self.turned @ skew(self.moved[1]) - self._cross_rate @ self.p_theta
 
     @cached_property
     def v_v(self) -> Array:

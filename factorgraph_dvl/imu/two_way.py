@@ -12,6 +12,7 @@ noise of the IMU adds up to from node to node; `noise_between` is what is left o
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -79,7 +80,19 @@ class TwoWayTransition:
 
 
 def attach_two_way(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
-    """Attach times (M,) to both nodes of their segments; those not covered, where nearest."""
+    """Attach times (M,) to both nodes of their segments; those not covered, where nearest.
+
+    Times that something still hangs on are not attached anew.
+    """
+    known = vars(seg).setdefault("_attached", WeakValueDictionary())
+    key = time.tobytes(), earth_rate_n.tobytes()
+    found = known.get(key)
+    if found is None:
+        found = known[key] = _attached(seg, time, earth_rate_n)
+    return found
+
+
+def _attached(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
     forward, beyond = attach_smoothly(seg, time, earth_rate_n)
     span = seg.duration[forward.segment]
     u = np.clip(forward.tau / span, 0.0, 1.0)
