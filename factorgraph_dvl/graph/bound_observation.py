@@ -153,8 +153,6 @@ class BoundObservation:
     def attach(self, parameters: Mapping[str, Array]) -> None:
         """Attach measurements to the chain by clocks as they are."""
         self.attachment = self.attached(parameters)
-        if self.errors is not None:
-            self.errors.attach([self.attachment])
 
     def motion(self, at: Any, states: Any, parameters: Mapping[str, Array]) -> Motion:
         """Return the motion where measurements hang on the chain."""
@@ -268,7 +266,7 @@ class BoundObservation:
         transition = transitions[here]
         found = dict(lin.d_parameters)
         if errors is not None and by is not None:
-            found |= errors.columns(lin, transition, by)
+            found |= errors.columns(lin, transition, by, errors.vector(parameters))
         by_chain = self.chain.node_jacobian(lin, transition)
         others = [found[name] for name in wanted]
         by_nodes = [

@@ -7,27 +7,28 @@ with the errors, so the errors get columns of their own in the linear factors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
+from weakref import WeakKeyDictionary
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
-    backward,
+    at_errors,
     by_errors,
-    corrected,
+    carried_back_by,
+    corrected_two_way,
     elements,
     predicted,
     sensitivities,
 )
-from factorgraph_dvl.imu.two_way import TwoWay, TwoWayTransition
+from factorgraph_dvl.imu.two_way import TwoWay, TwoWayTransition, shares
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -54,14 +55,6 @@ class LinearImuFactors:
     more_cost: float
 
 
-@dataclass(frozen=True)
-class TwoWaySensitivity:
-    """How what is integrated up to M times from both nodes moves with the errors."""
-
-    forward: Sensitivity
-    backward: Sensitivity
-
-
 class ImuErrors:
     """Errors of the IMU in a graph.
 
@@ -86,9 +79,9 @@ class ImuErrors:
         self._sizes = [p.mean.size for p in parameters]
         self._segments, self._parameters = segments, tuple(parameters)
         self._elements = elements(parameters)
-        self._whole: Sensitivity | None = None
-        # By identity of the attachment, which is kept with it.
-        self._by: dict[int, tuple[TwoWay, TwoWaySensitivity]] = {}
+        self._of_ends: Sensitivity | None = None
+        # For as long as something hangs there.
+        self._by: WeakKeyDictionary[TwoWay, Sensitivity] = WeakKeyDictionary()
         self._factors: list[gtsam.JacobianFactor] = []
 
     def of_part(self, segments: Segments) -> ImuErrors:
@@ -100,47 +93,46 @@ class ImuErrors:
         return np.concatenate([parameters[name] for name in self.names])
 
     def attach(self, attachments: Sequence[TwoWay]) -> None:
-        """Find how what is integrated up to attached times moves, and keep it for no others."""
-        known = {id(at): self._by.get(id(at)) for at in attachments}
-        new = [at for at in attachments if known[id(at)] is None]
-        unique = list({id(at): at for at in new}.values())
-        if unique or self._whole is None:
-            self._whole, found = sensitivities(
-                self._segments, self._elements, [at.forward for at in unique]
+        """Find how what is integrated up to attached times moves, of all of them at once."""
+        new = [at for at in {id(at): at for at in attachments}.values() if at not in self._by]
+        if new or self._of_ends is None:
+            self._of_ends, found = sensitivities(
+                self._segments, self._elements, [at.forward for at in new]
             )
-            for at, forward in zip(unique, found, strict=True):
-                of_ends = rows_of(self._whole, at.segment)
-                both = TwoWaySensitivity(forward, backward(self._segments, at, forward, of_ends))
-                known[id(at)] = at, both
-        self._by = {key: each for key, each in known.items() if each is not None}
+            self._by.update(zip(new, found, strict=True))
 
     @cached_property
     def _ends(self) -> Array:
         """Derivatives of the predicted states at the ends of segments, (S, 9, n)."""
-        if self._whole is None:
+        if self._of_ends is None:
             self.attach(())
-        assert self._whole is not None
-        return predicted(self._segments, self._whole)
+        assert self._of_ends is not None
+        return predicted(self._segments, self._of_ends)
 
-    def sensitivity(self, at: TwoWay) -> TwoWaySensitivity:
-        """Return how what is integrated up to attached times moves with the errors."""
-        return self._by[id(at)][1]
+    def sensitivity(self, at: TwoWay) -> Sensitivity:
+        """Return how what is integrated from the nodes before moves with the errors."""
+        self.attach([at])
+        return self._by[at]
 
-    def without(self, at: TwoWay, by: TwoWaySensitivity, errors: Array) -> TwoWay:
+    def without(self, at: TwoWay, by: Sensitivity, errors: Array) -> TwoWay:
         """Return an attachment without the errors (n,), which move it by its sensitivity."""
-        return replace(
-            at,
-            forward=corrected(at.forward, by.forward, self._elements, errors),
-            backward=corrected(at.backward, by.backward, self._elements, errors),
-        )
+        assert self._of_ends is not None
+        return corrected_two_way(at, by, self._of_ends, self._segments, self._elements, errors)
 
     def columns(
-        self, lin: Linearization, transition: TwoWayTransition, by: TwoWaySensitivity
+        self,
+        lin: Linearization,
+        transition: TwoWayTransition,
+        by: Sensitivity,
+        errors: Array,
     ) -> dict[str, Array]:
-        """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
-        share = transition.at.share[:, None, None]
-        every = (1.0 - share) * by_errors(lin, transition.forward, by.forward, self._elements)
-        every += share * by_errors(lin, transition.backward, by.backward, self._elements)
+        """Return derivatives of measurements by the errors (n,) there, (M, d, n_i) by name."""
+        assert self._of_ends is not None
+        by, ends = (at_errors(each, errors) for each in (by, self._of_ends))
+        back = carried_back_by(transition.at, by, ends)
+        ahead, behind = shares(lin, transition)
+        every = by_errors(ahead, transition.forward, by, self._elements)
+        every += by_errors(behind, transition.backward, back, self._elements)
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
 

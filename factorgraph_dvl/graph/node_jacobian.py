@@ -6,7 +6,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, cross, skew
 from factorgraph_dvl.imu.propagation import Transition, attitude_jacobian
-from factorgraph_dvl.imu.two_way import TwoWayTransition
+from factorgraph_dvl.imu.two_way import TwoWayTransition, shares
 from factorgraph_dvl.sensors.protocol import Linearization
 
 
@@ -16,9 +16,9 @@ def two_way_jacobian(lin: Linearization, transition: TwoWayTransition, *, walkin
     Columns: state and bias as of `node_jacobian`, then the state at the node after and, of biases
     that walk, that one's too.
     """
-    share = transition.at.share
-    state, bias = _by_node(_times(lin, 1.0 - share), transition.forward)
-    state_after, bias_after = _by_node(_times(lin, share), transition.backward)
+    ahead, behind = shares(lin, transition)
+    state, bias = _by_node(ahead, transition.forward)
+    state_after, bias_after = _by_node(behind, transition.backward)
     if walking:
         return np.concatenate([*state, *bias, *state_after, *bias_after], axis=2)
     both = (one + other for one, other in zip(bias, bias_after, strict=True))
@@ -40,12 +40,6 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
     """
     state, bias = _by_node(lin, transition)
     return np.concatenate([*state, *bias], axis=2)
-
-
-def _times(lin: Linearization, factor: Array) -> Linearization:
-    """Return derivatives by the motion times factors (M,)."""
-    by = (lin.d_theta, lin.d_p, lin.d_v, lin.d_omega)
-    return Linearization(lin.residual, *(d if d is None else factor[:, None, None] * d for d in by))
 
 
 def _by_node(lin: Linearization, transition: Transition) -> tuple[tuple[Array, ...], ...]:

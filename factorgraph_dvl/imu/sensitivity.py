@@ -17,9 +17,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
-from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.preintegration import Integrals, Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
-from factorgraph_dvl.imu.two_way import TwoWay
+from factorgraph_dvl.imu.two_way import TwoWay, carried_back
 from factorgraph_dvl.sensors.imu import ERRORS, ImuError
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
@@ -145,31 +145,70 @@ def predicted(seg: Segments, ends: Sensitivity) -> Array:
     return np.concatenate([back @ ends.theta, back @ ends.p, back @ ends.v], axis=1)
 
 
-def backward(seg: Segments, at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sensitivity:
-    """Return the sensitivity at M times of what is integrated back from the nodes after.
+def at_errors(by: Sensitivity, sizes: Array) -> Sensitivity:
+    """Return a sensitivity where errors have sizes (n,): a further one finds axes half turned."""
+    return replace(by, theta=by.theta + 0.5 * skew(by.theta @ sizes) @ by.theta)
 
-    With increments dR_b = dR_Tᵀ dR, dV_b = dR_Tᵀ (dV - dV_T) and dP_b likewise, all of those up
-    to the ends T moving with the errors as well.
+
+def carried_back_by(at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sensitivity:
+    """Return the sensitivity of what is integrated back from the nodes after, in the axes there.
+
+    Of increments dR_Tᵀ dR, dR_Tᵀ (dV - dV_T) and so on, all up to the times and to the ends T.
 
     Parameters
     ----------
+    at : TwoWay
+        Where M times hang on the chain.
+    forward : Sensitivity
+        Of what is integrated up to the times.
+    ends : Sensitivity
+        The same up to the ends of all segments.
+    """
+    theta, v, p = (each[at.segment] for each in (ends.theta, ends.v, ends.p))
+    back = at.backward.dR @ np.ascontiguousarray(at.forward.dR.transpose(0, 2, 1))
+    turned = back @ theta
+    return replace(
+        forward,
+        theta=back @ forward.theta - turned,
+        v=back @ (forward.v - v) + skew(at.backward.dV) @ turned,
+        p=back @ (forward.p - p - at.backward.tau[:, None, None] * v)
+        + skew(at.backward.dP) @ turned,
+    )
+
+
+def corrected_two_way(
+    at: TwoWay,
+    by: Sensitivity,
+    ends: Sensitivity,
+    seg: Segments,
+    errors: Sequence[ImuError],
+    sizes: Array,
+) -> TwoWay:
+    """Return an attachment without errors of the IMU of given sizes (n,).
+
+    Parameters
+    ----------
+    at : TwoWay
+        Where M times hang on the chain.
+    by, ends : Sensitivity
+        As `forward` and `ends` of `carried_back_by`.
     seg : Segments
         Increments between the nodes.
-    at : TwoWay
-        Where the times hang on the chain.
-    forward, ends : Sensitivity
-        Of what is integrated up to the times, and up to the ends of their segments.
+    errors : sequence of ImuError
+        The n errors.
+    sizes : ndarray, shape (n,)
+        Of them.
     """
-    back = seg.ends.dR[at.segment].transpose(0, 2, 1)
-    tau = at.backward.tau[:, None, None]
-    turned = back @ ends.theta
-    return Sensitivity(
-        theta=back @ (forward.theta - ends.theta),
-        v=back @ (forward.v - ends.v) + skew(at.backward.dV) @ turned,
-        p=back @ (forward.p - ends.p - ends.v * tau) + skew(at.backward.dP) @ turned,
-        gyro=forward.gyro,
-        force=forward.force,
+    forward = corrected(at.forward, by, errors, sizes)
+    whole = Integrals(
+        dR=exp_so3(ends.theta @ sizes) @ seg.ends.dR,
+        dV=seg.ends.dV + ends.v @ sizes,
+        dP=seg.ends.dP + ends.p @ sizes,
+        dA=seg.ends.dA,
     )
+    back = carried_back(whole, forward, at.backward)
+    # What biases do is left as it is, forward too: errors times biases are next to nothing.
+    return replace(at, forward=forward, backward=replace(back, dA=at.backward.dA))
 
 
 def corrected(

@@ -18,8 +18,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
-from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
-from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate
+from factorgraph_dvl.imu.preintegration import Integrals, Segments
 from factorgraph_dvl.imu.propagation import (
     Attachment,
     States,
@@ -28,10 +28,10 @@ from factorgraph_dvl.imu.propagation import (
     extrapolated,
     motion_at,
 )
-from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TwoWay:
     """Where M times hang on both nodes of their segments.
 
@@ -40,7 +40,9 @@ class TwoWay:
     forward, backward : Attachment
         To the node before, and to the node after: its times and increments are negative.
     share, share_rate : ndarray, shape (M,)
-        Share of the motion carried back, and its time derivative, 1/s.
+        Share s of the motion carried back, and its time derivative, 1/s.
+    bend : ndarray, shape (M,), s
+        s (1 - s) / 2 over the derivative of s, which both vanish at nodes.
     beyond : ndarray, shape (M,), s
         How much later than there each time is, where the chain does not cover it.
     """
@@ -49,6 +51,7 @@ class TwoWay:
     backward: Attachment
     share: Array
     share_rate: Array
+    bend: Array
     beyond: Array
 
     @property
@@ -70,11 +73,14 @@ class TwoWayTransition:
     ----------
     at : TwoWay
         Attachment of the times.
+    motion : Motion
+        At the times.
     forward, backward : Transition
         Of the motions carried from either.
     """
 
     at: TwoWay
+    motion: Motion
     forward: Transition
     backward: Transition
 
@@ -96,29 +102,42 @@ def _attached(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
     forward, beyond = attach_smoothly(seg, time, earth_rate_n)
     span = seg.duration[forward.segment]
     u = np.clip(forward.tau / span, 0.0, 1.0)
+    tau = forward.tau - span
+    place = replace(
+        forward, node=forward.node + 1, tau=tau, turn=exp_so3(-tau[:, None] * earth_rate_n)
+    )
     return TwoWay(
         forward=forward,
-        backward=_backward(seg, forward, span, earth_rate_n),
+        backward=carried_back(seg.ends, forward, place),
         share=u**2 * (3.0 - 2.0 * u),
         share_rate=6.0 * u * (1.0 - u) / span,
+        bend=span * u * (1.0 - u) * (3.0 - 2.0 * u) * (1.0 + 2.0 * u) / 12.0,
         beyond=beyond,
     )
 
 
-def _backward(seg: Segments, at: Attachment, span: Array, earth_rate_n: Array) -> Attachment:
-    """Return attached times as attached to the nodes after, in the axes there."""
-    whole = rows_of(seg.ends, at.segment)
-    back = whole.dR.transpose(0, 2, 1)
-    tau = at.tau - span
+def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Attachment:
+    """Return increments from the nodes after, in the axes there.
+
+    Parameters
+    ----------
+    ends : Integrals
+        Over all S segments.
+    forward : Attachment
+        Of M times to the nodes before.
+    place : Attachment
+        To the nodes after, with any increments.
+    """
+    whole = rows_of(ends, forward.segment)
+    back = np.ascontiguousarray(whole.dR.transpose(0, 2, 1))
     return replace(
-        at,
-        node=at.node + 1,
-        tau=tau,
-        dR=back @ at.dR,
-        dA=back @ (at.dA - whole.dA),
-        dV=rotate(back, at.dV - whole.dV),
-        dP=rotate(back, at.dP - whole.dP - whole.dV * tau[:, None]),
-        turn=exp_so3(-tau[:, None] * earth_rate_n),
+        place,
+        dR=back @ forward.dR,
+        dA=back @ (forward.dA - whole.dA),
+        dV=rotate(back, forward.dV - whole.dV),
+        dP=rotate(back, forward.dP - whole.dP - whole.dV * place.tau[:, None]),
+        gyro=forward.gyro,
+        force=forward.force,
     )
 
 
@@ -151,7 +170,33 @@ def transition_two_way(
     forward, backward = (
         Transition(way, states, motion, earth_rate_n) for way in (at.forward, at.backward)
     )
-    return TwoWayTransition(at, forward, backward)
+    return TwoWayTransition(at, motion, forward, backward)
+
+
+def shares(
+    lin: Linearization, transition: TwoWayTransition
+) -> tuple[Linearization, Linearization]:
+    """Return derivatives by the motion as those by the motions carried forward and back.
+
+    Of attitudes to first order in the turn phi between both:
+
+        (1 - s) (1 - s/2 [phi x]),    s (1 + (1 - s)/2 [phi x]).
+    """
+    at, turning = transition.at, transition.motion.turning_b
+    share = at.share[:, None, None]
+    ahead, behind = (
+        {
+            name: factor * jacobian
+            for name in ("d_theta", "d_p", "d_v", "d_omega")
+            if (jacobian := getattr(lin, name)) is not None
+        }
+        for factor in (1.0 - share, share)
+    )
+    if lin.d_theta is not None and turning is not None:
+        across = cross(lin.d_theta, (at.bend[:, None] * turning)[:, None])
+        ahead["d_theta"] -= across
+        behind["d_theta"] += across
+    return Linearization(lin.residual, **ahead), Linearization(lin.residual, **behind)
 
 
 def noise_between(at: TwoWay) -> Array:

@@ -131,7 +131,9 @@ def test_what_is_missing_half_way_by_hand(prepared):
     assert missing("d_v") == pytest.approx(q[4] * dt / 16.0)
     assert missing("d_p") == pytest.approx(q[4] * dt**3 / 192.0)
     assert missing("d_omega") == pytest.approx(q[1] * dt / 16.0)
-    assert missing("d_theta") == pytest.approx(q[1] * dt**3 / 192.0)
+    assert missing("d_theta", "d_omega") == pytest.approx(q[1] * (dt**3 / 192.0 + dt / 16.0))
+    # Attitudes alone are those by which the motion is known.
+    assert chain.missing(at, Linearization(zero, d_theta=along["d_theta"])) is None
     # Half-way both are independent; at a third, tau² rest² (rest - tau) / 2 dt³ = 2/243 dt².
     every = missing("d_p", "d_v", "d_theta", "d_omega")
     assert every == pytest.approx((q[1] + q[4]) * (dt / 16.0 + dt**3 / 192.0))
@@ -143,7 +145,9 @@ def test_what_is_missing_half_way_by_hand(prepared):
     late = replace(late, node=at.node)
     assert missing("d_v", at=late) == pytest.approx(q[4] * dt / 16.0)
     assert missing("d_omega", at=late) == pytest.approx(2.0 * q[1])
-    assert missing("d_theta", at=late) == pytest.approx(8.0 / 3.0 * q[1])
+    both = missing("d_theta", "d_omega", at=late)
+    # Of 2 s: tau³ / 3 of the value, tau of its rate, and twice tau² / 2.
+    assert both == pytest.approx((8.0 / 3.0 + 2.0 + 4.0) * q[1])
 
 
 def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
@@ -151,14 +155,15 @@ def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
     clock = problem.chain.attitude_clock
     (ping,) = (b for b in problem.bound if b.observation.unit == "m/s")
     # Where the record begins nodes are elsewhere.
-    at_nodes = np.abs(ping.time[:, None] - problem.chain.node_time).min(axis=1) < 1e-9
-    assert at_nodes.sum() > ping.time.size - 4
+    time = ping.times(start)
+    at_nodes = np.abs(time[:, None] - problem.chain.node_time).min(axis=1) < 1e-9
+    assert at_nodes.sum() > time.size - 4
 
     def missing(late):
         parameters = start | {clock: start[clock] + late}
         evaluation = problem.evaluate(problem.values(prepared.states, parameters))
-        motion = evaluation.motions[problem.bound.index(ping)]
-        return ping.missing(motion, evaluation.parameters, problem.processes_of(ping))
+        at, motion = (each[problem.bound.index(ping)] for each in (evaluation.attached, evaluation.motions))
+        return ping.missing(at, motion, evaluation.parameters, problem.processes_of(ping))
 
     # Attitudes of nodes are early by this.
     agreed = -problem.chain.shift(start)
@@ -195,7 +200,9 @@ def test_the_whole_graph_is_the_problem_also_where_clocks_have_moved(prepared, p
     problem.weigh(problem.evaluate(values))
     graph, start = problem.nonlinear_graph()
     evaluation = problem.evaluate(start)
-    assert max(np.abs(b.late(evaluation.parameters)).max() for b in problem.bound) > 0.02
+    bound = problem.bound_at
+    late = (b.times(evaluation.parameters) - b.times(bound) for b in problem.bound)
+    assert max(np.abs(each).max() for each in late) > 0.02
     ordering = problem.ordering()
     expected, _ = problem.linearize(evaluation).hessian(ordering)
     found, _ = graph.linearize(start).hessian(ordering)
