@@ -18,7 +18,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array, IntArray, median
 from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_steps
-from factorgraph_dvl.imu.interpolation import Smoothed, lead, smooth, unsmoothed
+from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -155,7 +155,7 @@ class Increments(ArcPolynomials):
             return Partial(phi, dv, dp, vectors, vectors, vectors, vectors, numbers, numbers)
         force = np.empty((index.size, 3))
         time = self.start[index] + since
-        for mine, (_, forces) in self._by_arc(index):
+        for mine, (_, forces) in self.by_arc(index):
             if forces.spline is None:
                 force[mine] = evaluate(c[mine, :, 3:], u[mine])
             else:
@@ -176,7 +176,7 @@ class Increments(ArcPolynomials):
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
         omega_sigma, alpha_sigma, force_sigma = np.empty((3, index.size))
         time = self.start[index] + since
-        for mine, (rate, forces) in self._by_arc(index):
+        for mine, (rate, forces) in self.by_arc(index):
             omega_sigma[mine], alpha_sigma[mine] = rate.sigma, rate.slope_sigma
             force_sigma[mine] = forces.sigma
             if rate.spline is None:
@@ -192,7 +192,7 @@ class Increments(ArcPolynomials):
             "force_sigma": force_sigma,
         }
 
-    def _by_arc(
+    def by_arc(
         self, index: IntArray
     ) -> Iterator[tuple[slice | IntArray, tuple[Smoothed, Smoothed]]]:
         """Yield which of intervals (M,) are in each arc, and its smoothed rate and force."""
@@ -208,9 +208,8 @@ class Increments(ArcPolynomials):
         return rate.window, force.window
 
     def release(self) -> None:
-        """Free what smoothing keeps, twice as much as the samples; it is found anew if needed."""
-        for name in ("smoothed", "leads"):
-            vars(self).pop(name, None)
+        """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
+        vars(self).pop("smoothed", None)
 
     @cached_property
     def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
@@ -230,24 +229,6 @@ class Increments(ArcPolynomials):
             if self.dt.size > _FEW:
                 forces = forces.on_knots_of(rates)
             out.append((rates, forces))
-        return tuple(out)
-
-    @cached_property
-    def leads(self) -> tuple[tuple[Array | None, Array | None], ...]:
-        """Integrals of each arc's smoothed rate and force less those of its samples, by edge.
-
-        (E, 3) in rad and m/s; None where the samples are left alone.
-        """
-        out = []
-        for (a, b), base, signals in zip(
-            self.arcs, self.first_sample, self.smoothed, strict=True
-        ):
-            own = slice(base, base + b - a + (not self.averaged))
-            rate, force = (
-                lead(values[own], signal.window, self.dt[a:b], averaged=self.averaged)
-                for values, signal in zip((self.rate, self.force), signals, strict=True)
-            )
-            out.append((rate, force))
         return tuple(out)
 
     def smooth_with_neighbours(self, time: Array, rate: Array, force: Array) -> None:

@@ -175,37 +175,6 @@ def smooth(
     )
 
 
-def lead(values: Array, width: int, dt: Array, *, averaged: bool) -> Array | None:
-    """Return by how much the integral of a smoothed signal is ahead of that of its samples.
-
-    It follows from samples within the window alone, and no noise adds up in it.
-
-    Parameters
-    ----------
-    values : ndarray, shape (N, 3)
-        Samples: means over the intervals, or values at their ends.
-    width : int
-        Samples of the window, 0 if they are left alone.
-    dt : ndarray, shape (M,), s
-        The intervals.
-    averaged : bool
-        Whether samples are means.
-
-    Returns
-    -------
-    ndarray, shape (M + 1, 3), or None
-        At the ends of the intervals; None where the samples are left alone.
-    """
-    if width == 0:
-        return None
-    integral = np.zeros((dt.size + 1, 3))
-    means = values if averaged else 0.5 * (values[1:] + values[:-1])
-    np.cumsum(means * dt[:, None], axis=0, out=integral[1:])
-    out = _filtered(integral, width)
-    out -= integral
-    return out
-
-
 def _long_spline(
     time: Array, values: Array, width: int, least: float, *, averaged: bool
 ) -> tuple[BSpline, Array]:
