@@ -26,6 +26,7 @@ import numpy as np
 from fault_rows import MOTIONS, ROWS, SCENARIOS, Row
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.graph.problem import Problem
@@ -45,8 +46,6 @@ LONGEST_S = 900.0
 LARGE, SEEN = 5.0, 30.0
 # Time between two looks at the processes, s: a run takes longer.
 LOOK_S = 0.2
-# Times that the problem is bound to the clocks anew for a noncentrality.
-BINDINGS = 3
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def outcome(run: Run) -> dict[str, Any]:
         made = run.trial()
     except FactorgraphDvlError as error:
         # No record may hold such values.
-        return {"grade": "refused", "exit": error.exit_code, "reason": str(error)}
+        return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
     with tempfile.TemporaryDirectory() as folder:
         save_trial(made, Path(folder) / "trial", parquet=True)
         start = time.process_time()
@@ -84,7 +83,7 @@ def outcome(run: Run) -> dict[str, Any]:
             trial = load_trial(Path(folder) / "trial")
             solution = solve(trial, rate_hz=1.0)
         except FactorgraphDvlError as error:
-            return {"grade": "refused", "exit": error.exit_code, "reason": str(error)}
+            return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
     return {
         "cpu_s": round(time.process_time() - start, 1),
         **errors(solution, made),
@@ -127,15 +126,9 @@ def _cost(trial: Trial) -> float:
     chain = prepared.chain(states)
     at_start = mounted_start(prepared, chain, states, _silent)
     states, values = at_start.states, at_start.values
-    cost = np.nan
-    for _ in range(BINDINGS):
-        problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
-        at = problem.values(states, problem.prior_values() | values)
-        found = minimise(problem, at, stage="noise as stated").evaluation
-        states, values, cost = found.states, found.parameters, found.cost
-        if not problem.needs_rebinding(values):
-            break
-    return float(cost)
+    problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
+    at = problem.values(states, problem.prior_values() | values)
+    return minimise(problem, at, stage="noise as stated").evaluation.cost
 
 
 def _silent(stage: str, iteration: int, cost: float | None) -> None:

@@ -2,9 +2,10 @@
 
 A measurement hangs on the nodes around it, through what was measured of the motion in between.
 Each sensor states its residual in terms of the motion at its time; the chain rule takes it to the
-nodes. A clock that is estimated moves its measurements along the chain at every evaluation. All measurements of a kind are evaluated in one NumPy pass and
-written into one Jacobian factor per node, because a Python callback per factor would be
-slow and makes GTSAM's optimisers copy all values.
+nodes. A clock that is estimated moves its measurements along the chain at every evaluation. All
+measurements of a kind are evaluated in one NumPy pass and written into one Jacobian factor per
+node, because a Python callback per factor would be slow and makes GTSAM's optimisers copy all
+values.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes,
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
+from factorgraph_dvl.graph.native_graph import native_graph
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
     Tilt,
@@ -180,6 +182,8 @@ class Problem:
         1 where there are none. `weigh` applies them.
     long_run : mapping of str to ndarray
         By label, factors (d,) for noise that persists for some measurements; likewise.
+    gain : float
+        Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
 
@@ -226,6 +230,7 @@ class Problem:
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
         self.long_run: Mapping[str, Array] = {}
+        self.gain = 0.0
         self.robust_weights: Mapping[str, Array] = {}
         self.bound_at = {**self.prior_values(), **(start or {})}
         # Where measurements were at the last evaluation, by their times.
@@ -354,7 +359,15 @@ class Problem:
             motions.append(computed[id(at)])
         residuals, cost = self._whitened(motions, parameters)
         return Evaluation(
-            values, states, parameters, attached, motions, residuals, own_cost + cost, own_cost, imu
+            values,
+            states,
+            parameters,
+            attached,
+            motions,
+            residuals,
+            own_cost + cost,
+            own_cost,
+            imu,
         )
 
     def _attached_at(self, parameters: dict[str, Array]) -> list[Any]:
@@ -375,6 +388,15 @@ class Problem:
         if self._imu_errors is not None:
             self._imu_errors.attach(out)
         return out
+
+    def without_tilt(self, evaluation: Evaluation) -> Evaluation:
+        """Return an evaluation whose cost is that of residuals alone."""
+        if self.tilt is None:
+            return evaluation
+        more = self.tilt.cost(self.parameters, evaluation.parameters)
+        return replace(
+            evaluation, cost=evaluation.cost - more, own_cost=evaluation.own_cost - more
+        )
 
     def _whitened(
         self, motions: Sequence[Motion], parameters: dict[str, Array]
@@ -502,15 +524,14 @@ class Problem:
         ):
             measured = np.isfinite(sigma)
             logarithm = np.log(np.where(measured, sigma, 1.0))
-            robust = self.robust_weights.get(bound.observation.label)
-            if robust is not None:
-                error = self.residual(bound.observation, motion, evaluation.parameters)
-                wrong = robust == 0.0
-                cost = gross_errors(
-                    np.where(measured, error, np.nan), sigma, wrong, bound.observation.unit
-                )
+            o = bound.observation
+            left_out = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
+            wrong = (self.robust_weights.get(o.label, np.ones(1)) == 0.0) | left_out[:, None]
+            if wrong.any():
+                error = self.residual(o, motion, evaluation.parameters)
+                cost = gross_errors(np.where(measured, error, np.nan), sigma, wrong, o.unit)
                 logarithm = np.where(wrong & measured, cost - 0.5 * np.log(2.0 * np.pi), logarithm)
-            out.append(bound.usable * np.sum(logarithm, axis=1))
+            out.append((bound.usable | left_out) * np.sum(logarithm, axis=1))
         return out
 
     def _weights(self, evaluation: Evaluation) -> list[Array]:
@@ -614,7 +635,9 @@ class Problem:
         """
         other, values = copy(self), {**evaluation.parameters, **parameters}
         seen = [i for i, bound in enumerate(self._bound) if parameters.keys() & bound.names]
-        attached, motions = ([each[i] for i in seen] for each in (evaluation.attached, evaluation.motions))
+        attached, motions = (
+            [each[i] for i in seen] for each in (evaluation.attached, evaluation.motions)
+        )
         other._bound = [self._bound[i] for i in seen]
         if parameters.keys() & ERRORS.keys():
             motions = [
@@ -649,8 +672,6 @@ class Problem:
         ValueError
             If measurements have not been weighed yet.
         """
-        from factorgraph_dvl.graph.native_graph import native_graph
-
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
         self._follow(self.evaluate(self._weighed_at))
@@ -722,9 +743,7 @@ class Problem:
     def _bind(self, observation: Observation, usable: BoolArray | None) -> BoundObservation:
         """Tie an observation to the chain."""
         nothing = np.empty(0)
-        out = BoundObservation(
-            observation, self.chain, None, nothing, nothing, self.clock_zero
-        )
+        out = BoundObservation(observation, self.chain, None, nothing, nothing, self.clock_zero)
         covered = self.chain.covers(out.times(self.bound_at))
         if usable is not None:
             covered = covered & usable

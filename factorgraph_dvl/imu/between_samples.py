@@ -1,7 +1,7 @@
 """Motion between the samples of an IMU, whose derivative does not jump where one ends.
 
-At the edges of its intervals the motion is that of the samples, and its slope the smoothed rate and
-force: so a clock that moves a time over a sample finds no jump, and not the noise of that sample.
+At the edges of its intervals the motion is that of the samples, and its slope the smoothed rate
+and force: a clock that moves a time over a sample finds no jump, and not the noise of the sample.
 """
 
 from __future__ import annotations

@@ -88,9 +88,7 @@ def attach(seg: Segments, time: Array, earth_rate_n: Array, *, rates: bool = Tru
     return _attach(seg, *_inside(seg, time), earth_rate_n, rates=rates)
 
 
-def attach_smoothly(
-    seg: Segments, time: Array, earth_rate_n: Array
-) -> tuple[Attachment, Array]:
+def attach_smoothly(seg: Segments, time: Array, earth_rate_n: Array) -> tuple[Attachment, Array]:
     """Attach times (M,) so that the motion has a continuous derivative in each of them.
 
     Returns
@@ -142,8 +140,13 @@ def segment_ends(seg: Segments, earth_rate_n: Array, *, rates: bool = True) -> A
 
 
 def _attach(
-    seg: Segments, index: IntArray, since: Array, earth_rate_n: Array, *, rates: bool = True,
-    smoothly: bool = False
+    seg: Segments,
+    index: IntArray,
+    since: Array,
+    earth_rate_n: Array,
+    *,
+    rates: bool = True,
+    smoothly: bool = False,
 ) -> Attachment:
     """Attach times `since` seconds after the start of intervals, some at a time."""
     inc, parts = seg.increments, []

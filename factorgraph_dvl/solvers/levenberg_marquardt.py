@@ -75,6 +75,7 @@ def minimise(
     tolerance: float = CONVERGED,
     proven: bool = True,
     enough: float = 0.0,
+    weighed: bool = False,
 ) -> Minimum:
     """Minimise a problem's cost.
 
@@ -104,13 +105,18 @@ def minimise(
         Whether QR must confirm the minimum.
     enough : float, default 0
         Mean square of a whitened residual below which no minimum is needed.
+    weighed : bool, default False
+        Whether measurements keep the weights that they have; by default, they are weighed at the
+        start.
 
     Raises
     ------
     SolveError
         If the cost at the start is not finite.
     """
-    evaluation = problem.weighed(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    if not weighed:
+        evaluation = problem.weighed(evaluation)
     if not np.isfinite(evaluation.cost):
         raise SolveError(
             "the cost at the start is not finite",

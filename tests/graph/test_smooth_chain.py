@@ -162,7 +162,9 @@ def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
     def missing(late):
         parameters = start | {clock: start[clock] + late}
         evaluation = problem.evaluate(problem.values(prepared.states, parameters))
-        at, motion = (each[problem.bound.index(ping)] for each in (evaluation.attached, evaluation.motions))
+        at, motion = (
+            each[problem.bound.index(ping)] for each in (evaluation.attached, evaluation.motions)
+        )
         return ping.missing(at, motion, evaluation.parameters, problem.processes_of(ping))
 
     # Attitudes of nodes are early by this.
