@@ -110,7 +110,7 @@ class BoundObservation:
             chain=chain,
             usable=self.usable[index],
             weight=self.weight[index],
-            errors=None if errors is None else errors.of_part(chain.segments),
+            errors=None if errors is None else chain.errors(errors.parameters, errors.key_of),
         )
 
     def parameters(self, every: Sequence[Parameter]) -> tuple[Parameter, ...]:

@@ -74,19 +74,17 @@ class ImuErrors:
         parameters: Sequence[Parameter],
         keys: Sequence[int],
     ) -> None:
+        self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in parameters)
+        self.key_of = dict(zip(self.names, keys, strict=True))
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
-        self._segments, self._parameters = segments, tuple(parameters)
+        self._segments = segments
         self._elements = elements(parameters)
         self._of_ends: Sensitivity | None = None
         # For as long as something hangs there.
         self._by: WeakKeyDictionary[TwoWay, Sensitivity] = WeakKeyDictionary()
         self._factors: list[gtsam.JacobianFactor] = []
-
-    def of_part(self, segments: Segments) -> ImuErrors:
-        """Return the same errors where the chain has some of its segments."""
-        return ImuErrors(segments, self._parameters, self._keys)
 
     def vector(self, parameters: Mapping[str, Array]) -> Array:
         """Return the errors among parameters, (n,), SI."""

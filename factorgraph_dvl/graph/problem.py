@@ -26,6 +26,7 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes, processes_of
 from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
 from factorgraph_dvl.graph.native_graph import native_graph
@@ -742,16 +743,14 @@ class Problem:
 
     def _bind(self, observation: Observation, usable: BoolArray | None) -> BoundObservation:
         """Tie an observation to the chain."""
-        nothing = np.empty(0)
-        out = BoundObservation(observation, self.chain, None, nothing, nothing, self.clock_zero)
-        covered = self.chain.covers(out.times(self.bound_at))
+        time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
+        covered = self.chain.covers(time)
         if usable is not None:
             covered = covered & usable
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
-        out.usable = covered
-        out.weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        return out
+        weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+        return BoundObservation(observation, self.chain, None, covered, weight, self.clock_zero)
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""

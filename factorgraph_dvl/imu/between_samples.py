@@ -20,11 +20,11 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
     force is that of the cubic.
     """
     (rate, force), (rate_after, force_after) = (
-        _edge(inc, index, after=after) for after in (False, True)
+        edge_signals(inc, index, after=after) for after in (False, True)
     )
     phi, dv = inc.over(index)
     dt = inc.dt[index]
-    values, slopes = _hermite(since / dt, dt)
+    values, slopes = hermite(since / dt, dt)
     across = cross(phi, rate_after)
     # Rotation vectors turn by Jr^-1(phi) rate.
     rate_after = rate_after + 0.5 * across + cross(phi, across) / 12.0
@@ -39,24 +39,25 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
     )
 
 
-def _hermite(u: Array, dt: Array) -> tuple[Array, Array]:
-    """Return weights (3, M) of a value after an interval and slopes before and after it.
+def hermite(u: Array, length: Array) -> tuple[Array, Array]:
+    """Return weights (4, M, 1, 1) of values and slopes at both ends of steps, in a cubic.
 
-    Of the value, which is 0 before, and of its derivative.
+    Of its value at shares u (M,) of steps of some lengths, and of its derivative.
     """
     v = 1.0 - u
+    last, change = u**2 * (3.0 - 2.0 * u), 6.0 * u * v / length
     return (
-        np.array([u**2 * (3.0 - 2.0 * u), dt * u * v**2, -dt * u**2 * v]),
-        np.array([6.0 * u * v / dt, v * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)]),
+        np.array([1.0 - last, last, length * u * v**2, -length * u**2 * v])[..., None, None],
+        np.array([-change, change, v * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)])[..., None, None],
     )
 
 
 def _cubic(weights: Array, *parts: Array) -> Array:
-    """Return the sum of vectors (M, 3) with weights (3, M)."""
-    return np.asarray(sum(w[:, None] * part for w, part in zip(weights, parts, strict=True)))
+    """Return the cubic with a value of 0 before, a value after, and slopes, (M, 3) each."""
+    return np.asarray(sum(w[:, :, 0] * part for w, part in zip(weights[1:], parts, strict=True)))
 
 
-def _edge(inc: Increments, index: IntArray, *, after: bool) -> Array:
+def edge_signals(inc: Increments, index: IntArray, *, after: bool) -> Array:
     """Return rate and force at the edges before or after intervals (M,), (2, M, 3)."""
     time = inc.start[index] + (inc.dt[index] if after else 0.0)
     out = np.empty((2, index.size, 3))

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
+from factorgraph_dvl.imu.between_samples import edge_signals, hermite
 from factorgraph_dvl.imu.preintegration import Integrals, Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.imu.two_way import TwoWay, carried_back
@@ -104,9 +105,10 @@ def sensitivities(
         segment = [
             at.segment[own] - block.start for at, own in zip(attachments, rows, strict=True)
         ]
+        numbers = [_stride_of(seg, at, own) for at, own in zip(attachments, rows, strict=True)]
         places = [
-            strides.begins[inside] + _stride_of(seg, at, own)
-            for at, own, inside in zip(attachments, rows, segment, strict=True)
+            strides.begins[inside] + number
+            for inside, number in zip(segment, numbers, strict=True)
         ]
         for j in range(int(strides.count.max())):
             for place, inside, own, outs in zip(places, segment, rows, attached, strict=True):
@@ -120,13 +122,28 @@ def sensitivities(
             theta[live], v[live], p[live] = step
         for out, each in zip(whole, (-theta, v, p), strict=True):
             out[block] = each
-        for place, at, own, outs in zip(places, attachments, rows, attached, strict=True):
-            dR = strides.dR[place]
-            back = dR.transpose(0, 2, 1)
+        for place, number, at, own, outs in zip(
+            places, numbers, attachments, rows, attached, strict=True
+        ):
+            first = seg.first[at.segment[own]] + seg.stride * number
+            last = np.minimum(first + seg.stride, seg.last[at.segment[own]]) - 1
+            begin = _Edge(strides.dR[place], *edge_signals(seg.increments, first, after=False))
+            phi, length = strides.phi[place], strides.duration[place]
+            end = _Edge(begin.dR @ exp_so3(phi), *edge_signals(seg.increments, last, after=True))
             since = seg.node_time[at.node[own]] + at.tau[own] - strides.start[place]
-            dV = at.dV[own] - strides.dV[place]
-            means = _means(log_so3(back @ at.dR[own]), rotate(back, dV), since)
-            theta, v, p = _step(dR, means, errors, tuple(out[own] for out in outs))
+            before = tuple(out[own] for out in outs)
+            after = _step(begin.dR, _means(phi, strides.dv[place], length), errors, before)
+            values, _ = hermite(since / length, length)
+            theta, v, p = (
+                values[0] * one + values[1] * other + values[2] * slope + values[3] * next_slope
+                for one, other, slope, next_slope in zip(
+                    before,
+                    after,
+                    begin.slopes(before, errors),
+                    end.slopes(after, errors),
+                    strict=True,
+                )
+            )
             for out, each in zip(outs, (-theta, v, p), strict=True):
                 out[own] = each
     nothing = np.zeros((seg.first.size, 3))
@@ -216,12 +233,15 @@ def corrected(
 ) -> Attachment:
     """Return an attachment without errors of the IMU of given sizes (n,)."""
     rate, force = added_by(by.gyro, by.force, errors, sizes)
+    # What the slope of the force adds is next to nothing.
+    alpha, _ = added_by(at.alpha, np.zeros_like(by.force), errors, sizes)
     return replace(
         at,
         dR=exp_so3(by.theta @ sizes) @ at.dR,
         dV=at.dV + by.v @ sizes,
         dP=at.dP + by.p @ sizes,
         gyro=at.gyro - rate,
+        alpha=at.alpha - alpha,
         force=at.force - force,
     )
 
@@ -286,6 +306,22 @@ class _Means:
     force: Array
     half: Array
     h: Array
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """Rotation (M, 3, 3) since the start of segments, rate and force (M, 3) there."""
+
+    dR: Array
+    rate: Array
+    force: Array
+
+    def slopes(self, at: tuple[Array, ...], errors: Sequence[ImuError]) -> tuple[Array, ...]:
+        """Return the time derivatives of Theta, V and P there."""
+        theta, v, _ = at
+        by_rate, by_force = unit_errors(self.rate, self.force, errors)
+        pushed = skew(rotate(self.dR, self.force)) @ theta - self.dR @ by_force
+        return self.dR @ by_rate, pushed, v
 
 
 def _means(phi: Array, dv: Array, h: Array) -> _Means:

@@ -137,6 +137,7 @@ def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Att
         dV=rotate(back, forward.dV - whole.dV),
         dP=rotate(back, forward.dP - whole.dP - whole.dV * place.tau[:, None]),
         gyro=forward.gyro,
+        alpha=forward.alpha,
         force=forward.force,
     )
 
