@@ -1,4 +1,4 @@
-"""Rows of data classes whose every field is an array of them, or has such: chosen, and joined."""
+"""Rows of data classes whose every field is an array of them: chosen, and joined."""
 
 from __future__ import annotations
 

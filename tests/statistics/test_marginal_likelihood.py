@@ -133,25 +133,6 @@ def test_gradient_is_that_of_the_dense_determinant(name):
     assert np.abs(sigma * gradient).max() > 0.05
 
 
-def test_gradient_by_a_clock_is_that_of_measurements_bound_anew():
-    problem, evaluation, information = system("all constants")
-    sigma = sigma_of(problem, information)
-    gradient = log_determinant_gradient(problem, evaluation, information)
-
-    def at(parameters):
-        bound = Problem(
-            problem.chain, problem.observations, problem.all_parameters, start=parameters
-        )
-        for each, weight in zip(bound._bound, problem.weights, strict=True):
-            each.weight = weight
-        moved = bound.evaluate(bound.values(evaluation.states, parameters))
-        return log_determinant(dense(bound, moved)[0])
-
-    for k, expected in differences(problem, evaluation, ["time_offset_s"], sigma, at):
-        assert abs(sigma[k] * gradient[k]) > 1e-4
-        assert gradient[k] == pytest.approx(expected, rel=0.01)
-
-
 def test_errors_that_persist_are_states():
     trial = {"trial": merged(CORRELATED["trial"], ALL_FREE)}
     scene = merged(CORRELATED, trial) | {"manoeuvres": SHORT}
@@ -243,7 +224,7 @@ def by_hand(c, x):
         noise_factors={},
         gain=0.0,
         chain=SimpleNamespace(interpolates=False, log_determinant=0.0),
-        bound=[SimpleNamespace(clocks={"c"})],
+        bound=[SimpleNamespace(clocks={"another"})],
         key=lambda name: C,
         log_sigma=lambda evaluation: [np.zeros(2)],
         observation_rows=lambda evaluation: rows(c),
@@ -266,12 +247,9 @@ def test_a_walk_measured_twice_by_hand(x):
     # det of the information is c⁴ + 3 c² + 1.
     gradient = log_determinant_gradient(problem, evaluation, information)
     assert gradient == pytest.approx([44 / 29], rel=1e-6)
-    # Where the motion is interpolated, that by a clock is left out.
-    problem.chain.interpolates = True
+    # That by a clock is left out.
+    problem.bound[0].clocks = {"c"}
     assert not log_determinant_gradient(problem, evaluation, information).any()
-    problem.bound[0].clocks = {"another"}
-    again = log_determinant_gradient(problem, evaluation, information)
-    np.testing.assert_array_equal(again, gradient)
 
 
 def test_the_restricted_objective_of_the_walk_by_hand():
