@@ -22,6 +22,7 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
+from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -66,6 +67,10 @@ class Prepared(Protocol):
         """Labels of the observations whose stated noise is only where to start."""
 
     @property
+    def noise_factors(self) -> Mapping[str, Array]:
+        """By label, factors (d,) on stated noise to start from, where they are known."""
+
+    @property
     def start_positions(self) -> StartPositions:
         """States to start from, one set for each position that the records allow."""
 
@@ -87,6 +92,9 @@ class Prepared(Protocol):
         self, chain: Any, states: Any, values: Mapping[str, Array]
     ) -> tuple[Process, ...]:
         """Return the processes that are in the problem from the start."""
+
+    def first_tilt(self, values: Mapping[str, Array]) -> Tilt | None:
+        """Return the gradient of the states' volume by the constants to start from."""
 
     def strengths(
         self, problem: Problem, minimum: Minimum, before: Strengths | None
@@ -135,6 +143,11 @@ class Preparation:
         """Times of measurements that are left out from the start, by label."""
         return self.start_positions.rejected
 
+    @property
+    def noise_factors(self) -> Mapping[str, Array]:
+        """Return none: noise starts as stated."""
+        return {}
+
     def start(self, chain: InertialChain, states: States, report: Progress) -> MountedStart:
         """Return where the minimisation with all sensors starts."""
         return mounted_start(self, chain, states, report)
@@ -144,6 +157,9 @@ class Preparation:
     ) -> tuple[Process, ...]:
         """Return none: noise is white until residuals show another one."""
         return ()
+
+    def first_tilt(self, values: Mapping[str, Array]) -> None:
+        """Return None: the volume of the states hardly depends on the constants."""
 
     def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
         """Return None: the IMU ties the nodes."""

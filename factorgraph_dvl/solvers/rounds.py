@@ -15,7 +15,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.bound_observation import EXTRAPOLATED
-from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
+from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.sensors.finding import Code, Finding
@@ -61,7 +61,7 @@ _NOISE_ROUNDS = 4
 # Estimates of the strength of a motion's prior, and promised fall of the cost that ends a
 # minimisation before the next one. Measured: four to eight are enough.
 _MOTION_ROUNDS = 20
-_ROUGHLY = 1e-2
+_ROUGHLY = 0.5
 # What of a problem changes without a new one.
 _NOISE = message("not_converged.noise")
 _OUTLIERS = message("not_converged.outliers")
@@ -154,9 +154,7 @@ def settle(
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
     parameters: tuple[Parameter, ...] = prepared.parameters
-    tilt: Tilt | None = None
-    if chain.interpolates and constants_prior is None:
-        tilt = Tilt.holding(parameters, values)
+    tilt = prepared.first_tilt(values) if constants_prior is None else None
     rejected = prepared.rejected
     tried: list[Mapping[str, Array]] = []
     cycle: list[Mapping[str, Array]] = []
@@ -175,7 +173,9 @@ def settle(
     motion = 0
     last_strengths: Strengths | None = None
     stated = prepared.stated_processes(chain, states, values)
-    first_levels = _NoiseLevels((as_stated,), bool(as_stated), processes=stated)
+    first_levels = _NoiseLevels(
+        ({**as_stated, **prepared.noise_factors},), bool(as_stated), processes=stated
+    )
     levels = first_levels
     changing = [message("not_converged.all")]
     tolerance: Mapping[str, float] = {}

@@ -50,7 +50,7 @@ Journal of the American Statistical Association 72(358), 1977.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -58,7 +58,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.statistics.rows import with_own_covariance
+from factorgraph_dvl.statistics.rows import product, with_own_covariance
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Step of a difference, in standard deviations of the parameter, and at most, SI. Chosen: what
@@ -66,6 +66,9 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 # gradient times the standard deviation.
 _STEP = 1e-3
 _LONGEST_STEP = 1e-6
+
+# Covariance of rows with their own states, by source and number of the first item.
+WithStates = dict[tuple[str, int], Array]
 
 
 def marginal_objective(
@@ -90,7 +93,7 @@ def marginal_objective(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    return _objective(problem, evaluation, information.given(_constants(problem)))
+    return _objective(problem, evaluation, information.given(constants_of(problem)))
 
 
 def restricted_objective(
@@ -114,7 +117,10 @@ def _objective(
 
 
 def log_determinant_gradient(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    with_states: WithStates | None = None,
 ) -> Array:
     """Return the gradient (P,) of log det of the states' information by the constants.
 
@@ -130,17 +136,20 @@ def log_determinant_gradient(
         Where the graph is linear.
     information : SquareRootInformation
         From the elimination there, the constants last.
+    with_states : dict, optional
+        `by_place` of all rows of observations, where that is known.
     """
-    constants = _constants(problem)
+    constants = constants_of(problem)
     out = np.zeros(len(problem.prior_root))
     if not constants:
         return out
     every = {problem.key(name): np.eye(out.size)[:, own] for name, own in problem.columns.items()}
     sigma = np.sqrt(np.diag(information.covariance_of([every])))
     steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
-    with_states = _covariance_with_states(
-        problem.observation_rows(evaluation), information.given(constants), constants
-    )
+    if with_states is None:
+        rows = list(problem.observation_rows(evaluation))
+        given = information.given(constants)
+        with_states = by_place(rows, covariance_with_states(rows, given, constants))
 
     def total(p: Parameter, value: Array) -> float:
         every = problem.observation_rows_at(evaluation, {p.name: value})
@@ -159,7 +168,7 @@ def log_determinant_gradient(
     return out
 
 
-def _constants(problem: Problem) -> set[int]:
+def constants_of(problem: Problem) -> set[int]:
     """Return the keys of the constants."""
     return {problem.key(p.name) for p in problem.parameters}
 
@@ -174,15 +183,43 @@ def _by_states(rows: Rows, constants: set[int]) -> Array:
     return rows.matrix[:, :, : sum(rows.sizes[: _states_of(rows, constants)])]
 
 
-def _covariance_with_states(
-    every: Iterable[Rows], given: SquareRootInformation, constants: set[int]
-) -> dict[tuple[str, int], Array]:
-    """Return the covariance J P of rows with their own states given the constants, (M, d, n).
+def covariance_with_states(
+    every: Sequence[Rows], given: SquareRootInformation, constants: set[int]
+) -> list[Array]:
+    """Return the covariances J P of rows with their own states given the constants, (M, d, n)."""
+    parts = [
+        (rows.keys[:, : _states_of(rows, constants)], _by_states(rows, constants))
+        for rows in every
+    ]
+    return with_own_covariance(parts, given)
 
-    By source and number of the first item.
+
+def by_place(every: Sequence[Rows], with_states: Sequence[Array]) -> WithStates:
+    """Return what rows of observations have by source and number of the first item."""
+    return {(r.source, r.begin): each for r, each in zip(every, with_states, strict=True)}
+
+
+def leverage_of(
+    rows: Rows,
+    with_states: Array,
+    with_constants: Mapping[int, Array],
+    root: Array,
+    constants: set[int],
+) -> Array:
+    """Return the leverages (M, d) of rows, exact: by their states, and by the constants.
+
+    Parameters
+    ----------
+    rows : Rows
+        Of the graph.
+    with_states : ndarray, shape (M, d, n)
+        Their `covariance_with_states`.
+    with_constants : mapping of int to ndarray
+        Covariance (size, C) of every variable with the constants.
+    root : ndarray, shape (C, C)
+        Square root S of the information S Sᵀ on the constants.
+    constants : set of int
+        Their keys.
     """
-    places, parts = [], []
-    for rows in every:
-        places.append((rows.source, rows.begin))
-        parts.append((rows.keys[:, : _states_of(rows, constants)], _by_states(rows, constants)))
-    return dict(zip(places, with_own_covariance(parts, given), strict=True))
+    of_states = np.sum(with_states * _by_states(rows, constants), axis=2)
+    return np.asarray(of_states + np.sum((product(rows, with_constants) @ root) ** 2, axis=2))

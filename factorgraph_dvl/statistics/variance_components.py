@@ -21,7 +21,7 @@ _PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 # of its error.
 LEAST_FACTOR = 0.1
 # Redundancy below which no factor is estimated. Chosen: it would be uncertain by over 20 %.
-_LEAST_REDUNDANCY = 10.0
+LEAST_REDUNDANCY = 10.0
 # Groups of the components of a process that is of no observation.
 _TOGETHER = ((0, 1),)
 # Relative change of a factor from which on it counts, and in its own standard deviations.
@@ -175,7 +175,7 @@ def _white(
         redundancy[group] = left
         total = float(squares[group] @ before[group] ** 2)
         found = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
-        if left < _LEAST_REDUNDANCY or (found < LEAST_FACTOR and before[group[0]] == 1.0):
+        if left < LEAST_REDUNDANCY or (found < LEAST_FACTOR and before[group[0]] == 1.0):
             factor[group] = before[group]
         else:
             # Not back to what is stated: that would come and go.
