@@ -32,8 +32,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR, LEAST_REDUNDANCY
 
 # Change of a logarithm, and fall of -2 log of the likelihood by it, from which on another estimate
-# follows. Chosen: less changes no σ that is shown; its own standard deviation.
-_SAME, LEAST_GAIN = 0.2, 1.0
+# follows. Chosen: less changes no σ that is shown; 1.4 times its own standard deviation.
+_SAME, LEAST_GAIN = 0.2, 2.0
 # Largest change of one estimate. Chosen: the information holds near by.
 _LARGEST = 3.0
 # Movement of the constants, in standard deviations, from which on another estimate follows.
@@ -200,6 +200,10 @@ def _step(strengths: Sequence[_Strength], score: RestrictedScore) -> tuple[Array
     bend[held], bend[:, held] = 0.0, 0.0
     bend[held, held] = 1.0
     change = np.clip(np.linalg.solve(bend, slope), -_LARGEST, _LARGEST)
+    # A variance that goes to zero does so along a line, its logarithm for ever.
+    plain = np.linalg.solve(bend, np.where(held, 0.0, squares - freedom))
+    weak = (plain < 0.0) & (2.0 * np.diag(bend) < squares)
+    change[weak] = np.log(np.maximum(1.0 + plain[weak], np.exp(-_LARGEST)))
     return change, (squares - freedom) * change - 0.5 * np.diag(bend) * change**2
 
 
