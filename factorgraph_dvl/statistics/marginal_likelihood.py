@@ -67,8 +67,9 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 _STEP = 1e-3
 _LONGEST_STEP = 1e-6
 
-# Covariance of rows with their own states, by source and number of the first item.
-WithStates = dict[tuple[str, int], Array]
+# Rows of observations and their covariance with their own states, by source and number of the
+# first item.
+WithStates = dict[tuple[str, int], tuple[Rows, Array]]
 
 
 def marginal_objective(
@@ -151,20 +152,23 @@ def log_determinant_gradient(
         given = information.given(constants)
         with_states = by_place(rows, covariance_with_states(rows, given, constants))
 
-    def total(p: Parameter, value: Array) -> float:
-        every = problem.observation_rows_at(evaluation, {p.name: value})
-        found = ((rows, with_states[rows.source, rows.begin]) for rows in every)
-        return sum(float(np.vdot(_by_states(rows, constants), own)) for rows, own in found)
+    def change(p: Parameter, value: Array) -> float:
+        """Return by how much the sum at a value differs from that of the evaluation."""
+        total = 0.0
+        for rows in problem.observation_rows_at(evaluation, {p.name: value}):
+            before, own = with_states[rows.source, rows.begin]
+            changed = _by_states(rows, constants) - _by_states(before, constants)
+            total += float(np.vdot(changed, own))
+        return total
 
     clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
         if problem.chain.interpolates and p.name in clocks:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
-        before = total(p, value)
         for i, step in enumerate(np.diag(steps[own])):
-            after = total(p, value @ exp_so3(step) if p.rotation else value + step)
-            out[own.start + i] = 2.0 * (after - before) / step[i]
+            changed = change(p, value @ exp_so3(step) if p.rotation else value + step)
+            out[own.start + i] = 2.0 * changed / step[i]
     return out
 
 
@@ -195,8 +199,8 @@ def covariance_with_states(
 
 
 def by_place(every: Sequence[Rows], with_states: Sequence[Array]) -> WithStates:
-    """Return what rows of observations have by source and number of the first item."""
-    return {(r.source, r.begin): each for r, each in zip(every, with_states, strict=True)}
+    """Return rows with their `covariance_with_states` by source and number of the first item."""
+    return {(r.source, r.begin): (r, each) for r, each in zip(every, with_states, strict=True)}
 
 
 def leverage_of(
