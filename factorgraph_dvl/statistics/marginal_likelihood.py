@@ -152,23 +152,31 @@ def log_determinant_gradient(
         given = information.given(constants)
         with_states = by_place(rows, covariance_with_states(rows, given, constants))
 
-    def change(p: Parameter, value: Array) -> float:
-        """Return by how much the sum at a value differs from that of the evaluation."""
-        total = 0.0
-        for rows in problem.observation_rows_at(evaluation, {p.name: value}):
-            before, own = with_states[rows.source, rows.begin]
-            changed = _by_states(rows, constants) - _by_states(before, constants)
-            total += float(np.vdot(changed, own))
-        return total
+    def total(p: Parameter, value: Array) -> float:
+        every = problem.observation_rows_at(evaluation, {p.name: value})
+        found = ((rows, with_states[rows.source, rows.begin][1]) for rows in every)
+        return sum(float(np.vdot(_by_states(rows, constants), own)) for rows, own in found)
+
+    # By source: of the same rows, where the motion is that of the evaluation.
+    known: dict[str, float] = {}
+    for rows, own in with_states.values():
+        product_ = float(np.vdot(_by_states(rows, constants), own))
+        known[rows.source] = known.get(rows.source, 0.0) + product_
+
+    def before(p: Parameter, value: Array) -> float:
+        if not problem.chain.interpolates:
+            return total(p, value)
+        return sum(known[b.observation.label] for b in problem.bound if p.name in b.names)
 
     clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
         if problem.chain.interpolates and p.name in clocks:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
+        at_value = before(p, value)
         for i, step in enumerate(np.diag(steps[own])):
-            changed = change(p, value @ exp_so3(step) if p.rotation else value + step)
-            out[own.start + i] = 2.0 * changed / step[i]
+            after = total(p, value @ exp_so3(step) if p.rotation else value + step)
+            out[own.start + i] = 2.0 * (after - at_value) / step[i]
     return out
 
 

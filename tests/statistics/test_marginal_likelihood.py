@@ -220,7 +220,9 @@ def by_hand(c, x):
         prior_root=np.eye(1),
         processes=(),
         chain=SimpleNamespace(interpolates=False),
-        bound=[SimpleNamespace(clocks={"c"})],
+        bound=[
+            SimpleNamespace(clocks={"c"}, names={"c"}, observation=SimpleNamespace(label="y"))
+        ],
         key=lambda name: C,
         log_sigma=lambda evaluation: [np.zeros(2)],
         observation_rows=lambda evaluation: rows(c),
@@ -248,7 +250,7 @@ def test_a_walk_measured_twice_by_hand(x):
     assert not log_determinant_gradient(problem, evaluation, information).any()
     problem.bound[0].clocks = {"another"}
     again = log_determinant_gradient(problem, evaluation, information)
-    np.testing.assert_array_equal(again, gradient)
+    np.testing.assert_allclose(again, gradient, rtol=1e-9)
 
 
 def test_the_restricted_objective_of_the_walk_by_hand():
