@@ -36,6 +36,8 @@ from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR, LEAST_R
 _SAME, LEAST_GAIN = 0.2, 2.0
 # Largest change of one estimate. Chosen: the information holds near by.
 _LARGEST = 3.0
+# The same of one that goes to zero.
+_TO_ZERO = 6.0
 # Movement of the constants, in standard deviations, from which on another estimate follows.
 _SAME_CONSTANTS = 0.1
 # Longest step of the constants, in standard deviations of all together, that a gradient of the
@@ -203,7 +205,7 @@ def _step(strengths: Sequence[_Strength], score: RestrictedScore) -> tuple[Array
     # A variance that goes to zero does so along a line, its logarithm for ever.
     plain = np.linalg.solve(bend, np.where(held, 0.0, squares - freedom))
     weak = (plain < 0.0) & (2.0 * np.diag(bend) < squares)
-    change[weak] = np.log(np.maximum(1.0 + plain[weak], np.exp(-_LARGEST)))
+    change[weak] = np.log(np.maximum(1.0 + plain[weak], np.exp(-_TO_ZERO)))
     return change, (squares - freedom) * change - 0.5 * np.diag(bend) * change**2
 
 
