@@ -167,7 +167,8 @@ class BoundObservation:
     def attached(self, parameters: Mapping[str, Array]) -> Any:
         """Return where measurements hang on the chain by clocks as they are."""
         time = self.time + self.late(parameters)
-        return self.chain.attach(time, self.chain.shift(parameters), turning=self.turning)
+        shift = self.chain.shift(parameters)
+        return self.chain.attach(time, shift, turning=self.turning, before=self.attachment)
 
     def late(self, parameters: Mapping[str, Array]) -> Array:
         """Return by how much clocks have moved measurements since they were bound, (M,), s."""

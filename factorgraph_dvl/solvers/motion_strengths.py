@@ -123,9 +123,10 @@ def motion_strengths(
             # At a bound, what is asked for beyond it changes nothing.
             wanted[i] = np.log(after / before)
         elif s.name in factors:
-            factors[s.name][own] = np.maximum(
-                factors[s.name][own] * np.exp(0.5 * wanted[i]), LEAST_FACTOR
-            )
+            before = factors[s.name][own[0]]
+            after = max(before * float(np.exp(0.5 * wanted[i])), LEAST_FACTOR)
+            factors[s.name][own] = after
+            wanted[i] = 2.0 * np.log(after / before)
         else:
             sigma[s.name][own] *= np.exp(0.5 * wanted[i])
     values = dict(evaluation.parameters)
@@ -197,7 +198,9 @@ def _step(strengths: Sequence[_Strength], score: RestrictedScore) -> tuple[Array
     # variance is known, and there this is its change, however large.
     slope = squares * np.log(squares / freedom)
     bend = score.information + np.diag(squares - score.squares)
-    held = (stated > 0.0) & (score.freedom < LEAST_REDUNDANCY)
+    # What is smaller by far than stated is that of a record that was smoothed: see `LEAST_FACTOR`.
+    smoothed = (stated == 1.0) & (squares < LEAST_FACTOR**2 * freedom)
+    held = smoothed | ((stated > 0.0) & (score.freedom < LEAST_REDUNDANCY))
     slope[held] = 0.0
     bend[held], bend[:, held] = 0.0, 0.0
     bend[held, held] = 1.0

@@ -61,7 +61,7 @@ _NOISE_ROUNDS = 4
 # Estimates of the strength of a motion's prior, and promised fall of the cost that ends a
 # minimisation before the next one. Measured: four to eight are enough.
 _MOTION_ROUNDS = 20
-_ROUGHLY = 0.5
+_ROUGHLY = 1e-2
 # What of a problem changes without a new one.
 _NOISE = message("not_converged.noise")
 _OUTLIERS = message("not_converged.outliers")
