@@ -243,7 +243,7 @@ def factorized(
 def quickly_factorized(
     problem: Problem, evaluation: Evaluation
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
-    """Return what `factorized` does, by Cholesky's factorisation: from QR where that has no digits.
+    """Return what `factorized` does, by Cholesky: from QR where that has no digits.
 
     It takes a third of the time. Across a gap of a record it may lose digits: for what is
     estimated again, not for the standard deviations of a result.

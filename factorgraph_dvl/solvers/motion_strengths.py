@@ -116,9 +116,7 @@ def motion_strengths(
         if s.name in kinds:
             (component,) = s.components
             before = density[kinds[s.name], component][0]
-            after = float(
-                np.clip(before * np.exp(wanted[i]), _LEAST[component], _MOST[component])
-            )
+            after = float(np.clip(before * np.exp(wanted[i]), _LEAST[component], _MOST[component]))
             density[kinds[s.name], component] = after
             # At a bound, what is asked for beyond it changes nothing.
             wanted[i] = np.log(after / before)
@@ -135,7 +133,9 @@ def motion_strengths(
         nodes = values[process.name].copy()
         nodes[:, : ratio.size] /= np.where(ratio > 0.0, ratio, 1.0)
         values[process.name] = nodes
-    moved = np.concatenate([step.at(problem.key(name)) for name in problem.columns] or [np.zeros(0)])
+    moved = np.concatenate(
+        [step.at(problem.key(name)) for name in problem.columns] or [np.zeros(0)]
+    )
     tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
     other = (np.abs(wanted) > _SAME) & (gain > least_gain)
     same = not other.any() and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS

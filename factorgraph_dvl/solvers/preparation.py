@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import InertialChain, inertial_chain
+from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem, observed
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.increments import increments
@@ -22,7 +23,6 @@ from factorgraph_dvl.imu.timestamps import without_strays
 from factorgraph_dvl.initialization.attitude_sensors import attitudes
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
-from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter

@@ -27,11 +27,7 @@ def system(variances):
 def minus_two_log(variances):
     J, y, sigma = system(variances)
     x = np.linalg.lstsq(J, y, rcond=None)[0]
-    return (
-        np.sum((y - J @ x) ** 2)
-        + 2.0 * np.log(sigma).sum()
-        + np.linalg.slogdet(J.T @ J)[1]
-    )
+    return np.sum((y - J @ x) ** 2) + 2.0 * np.log(sigma).sum() + np.linalg.slogdet(J.T @ J)[1]
 
 
 @pytest.fixture(scope="module")
@@ -63,9 +59,7 @@ def found():
     for number, (rows, part) in enumerate(((measured, share), (steps, 1.0))):
         shape = rows.vector.shape
         leverage = (h[:COUNT] if number == 0 else h[COUNT:])[:, None]
-        parts.append(
-            SharedRows(rows, np.full(shape, number), np.full(shape, part), leverage)
-        )
+        parts.append(SharedRows(rows, np.full(shape, number), np.full(shape, part), leverage))
     information = eliminated(graph, keys.ordering(names), dict.fromkeys(names, 1))
     return restricted_score(parts, 2, information)
 

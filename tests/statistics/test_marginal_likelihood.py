@@ -220,9 +220,7 @@ def by_hand(c, x):
         prior_root=np.eye(1),
         processes=(),
         chain=SimpleNamespace(interpolates=False),
-        bound=[
-            SimpleNamespace(clocks={"c"}, names={"c"}, observation=SimpleNamespace(label="y"))
-        ],
+        bound=[SimpleNamespace(clocks={"c"}, names={"c"}, observation=SimpleNamespace(label="y"))],
         key=lambda name: C,
         log_sigma=lambda evaluation: [np.zeros(2)],
         observation_rows=lambda evaluation: rows(c),
