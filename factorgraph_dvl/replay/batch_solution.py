@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Noise
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
@@ -16,7 +17,6 @@ from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
-from factorgraph_dvl.solution import Noise
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.preparation_without_imu import (
     PreparationWithoutImu,

@@ -8,8 +8,8 @@ from collections import Counter, deque
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
 _LIMIT = 6.0

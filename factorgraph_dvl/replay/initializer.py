@@ -9,12 +9,12 @@ import numpy as np
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.history import RecordHistory
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.trial import InitialPosition, Trial
 

@@ -11,10 +11,10 @@ from factorgraph_dvl.graph.clocks import parameters_of, true_time
 from factorgraph_dvl.graph.sensor_factor import AttachedMeasurements, NodeMeasurements
 from factorgraph_dvl.graph.trajectory import Epochs, attached_epochs
 from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.protocol import Aid
 
 

@@ -9,6 +9,7 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
@@ -36,6 +37,7 @@ from factorgraph_dvl.graph.trajectory import (
     trajectory_at,
 )
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.gravity import LocalGravity
@@ -44,11 +46,9 @@ from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
-from factorgraph_dvl.solution import Trajectory
 
 
 @dataclass(frozen=True)

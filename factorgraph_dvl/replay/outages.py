@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 
 # Silence, s, that counts as an outage; chosen: several pings, and short against the time over
 # which an INS drifts.

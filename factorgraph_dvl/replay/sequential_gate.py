@@ -9,9 +9,9 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations beyond which a measurement does not change the prediction of the next.

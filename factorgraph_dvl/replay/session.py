@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.clocks import Clocks
 from factorgraph_dvl.replay.duplicates import Duplicates
 from factorgraph_dvl.replay.gate import InnovationGate
@@ -24,11 +27,9 @@ from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.pending import AHEAD, SAME_TIME, PendingMeasurements
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Noise, Progress, Trajectory
+from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import Trial
 

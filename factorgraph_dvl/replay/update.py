@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solution import Trajectory
 
 
 @dataclass(frozen=True)

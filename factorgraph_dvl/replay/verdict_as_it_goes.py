@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.message import message
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import consistency_findings
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Calibration, consistency_findings
+from factorgraph_dvl.solution import Calibration
 from factorgraph_dvl.trial import Trial
 
 # What holds only until something else is said.

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph import keys
@@ -27,7 +28,6 @@ from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.posterior import Posterior, posterior
 from factorgraph_dvl.solvers.true_times import (

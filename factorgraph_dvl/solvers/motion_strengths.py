@@ -14,7 +14,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, quickly_factorized
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.average_information import (
     RestrictedScore,
     SharedRows,
@@ -103,7 +103,8 @@ def motion_strengths(
     evaluation = problem.weighed(minimum.evaluation)
     # Nothing holds the constants in what follows.
     problem.tilt = None
-    information, step = quickly_factorized(problem, evaluation)
+    information = minimum.information
+    step = information.solution()
     strengths = _strengths_of(problem, phase)
     score, gradient, covariance = _score(problem, evaluation, information, phase, strengths)
     wanted, gain = _step(strengths, score)

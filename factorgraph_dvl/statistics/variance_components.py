@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.statistics.leverage import exact_leverage, leverage
+from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -62,13 +64,29 @@ class VarianceComponents:
         By label, factors on the standard deviations that sensors state.
     correlated : dict of str to NoiseFactor
         By label, factors on the innovations of correlated noise, relative to those assumed.
-    steps : tuple of ndarray, shape (K - 1, d), optional
-        Squares of the residuals from node to node, and what is left of their freedom.
     """
 
     white: dict[str, NoiseFactor]
     correlated: dict[str, NoiseFactor]
-    steps: tuple[Array, Array] | None = None
+
+
+def log_prior(noise_factors: Mapping[str, Array], observations: Iterable[Observation]) -> float:
+    """Return -2 log of the prior of factors on stated noise: nu (1/f² + log f²) of each group.
+
+    Parameters
+    ----------
+    noise_factors : mapping of str to ndarray
+        By label, factors (d,).
+    observations : iterable of Observation
+        Their components share factors in groups.
+    """
+    square = [
+        float(noise_factors[o.label][group[0]]) ** 2
+        for o in observations
+        if o.label in noise_factors
+        for group in o.noise_groups
+    ]
+    return _PRIOR_FREEDOM * sum(1.0 / f + float(np.log(f)) for f in square)
 
 
 def variance_components(
@@ -97,30 +115,22 @@ def variance_components(
         Information there.
     """
     processes = {CORRELATED.format(p.label): p for p in problem.processes}
-    steps = problem.chain.step_source
-    wanted = {*problem.noise_factors, *processes, *((steps,) if steps else ())}
-    native = bool(processes) or steps is not None
-    source = partial(rows_by_source, problem) if native else problem.observation_rows
+    wanted = {*problem.noise_factors, *processes}
+    source = partial(rows_by_source, problem) if processes else problem.observation_rows
     count = sum(
         residual.size
         for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
         if o.label in wanted
     )
     count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
-    count += problem.chain.count * 12 * (steps is not None)
     found: dict[str, list[tuple[Array, Array]]] = {}
     estimated = partial(filter, lambda rows: rows.source in wanted)
-    with_leverage = (
-        leverage(lambda: estimated(source(evaluation)), count, information)
-        if steps is None
-        else exact_leverage(estimated(source(evaluation)), information)
-    )
-    for rows, h in with_leverage:
+    for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
         found.setdefault(rows.source, []).append((rows.vector, h))
     white = {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
         for label, parts in found.items()
-        if label not in processes and label != steps
+        if label not in processes
     }
     groups = {o.label: o.noise_groups for o in problem.observations}
     correlated = {
@@ -128,11 +138,7 @@ def variance_components(
         for source_name, p in processes.items()
         if p.label in problem.noise_factors or p.free
     }
-    of_steps = None
-    if steps is not None:
-        r, h = map(np.concatenate, zip(*found[steps], strict=True))
-        of_steps = r**2, 1.0 - h
-    return VarianceComponents(white, correlated, of_steps)
+    return VarianceComponents(white, correlated)
 
 
 def _innovations(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.sensors.finding import Code
 
 
 def test_a_kind_of_outliers_is_excluded_until_it_agrees():

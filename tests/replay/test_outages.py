@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.outages import Outages
 from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 
 
 def test_outages_is_that_of_arrivals():
