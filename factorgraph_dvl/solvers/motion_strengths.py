@@ -102,8 +102,6 @@ def motion_strengths(
     chain = problem.chain
     assert isinstance(chain, SmoothChain)
     evaluation = problem.weighed(minimum.evaluation)
-    # Nothing holds the constants in what follows.
-    problem.tilt = None
     information = minimum.information
     step = information.solution()
     strengths = _strengths_of(problem, phase)
