@@ -28,12 +28,14 @@ from factorgraph_dvl.solvers.steps import (
     Correlation,
     Gates,
     GrossErrors,
+    ImuNoise,
     KnownParameters,
     MotionStrengths,
     Noise,
     Proposal,
     States,
     Step,
+    Uncorrelated,
     Walks,
 )
 
@@ -103,7 +105,8 @@ def settle(
     known = KnownParameters()
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(), walks,
+        MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(),
+        ImuNoise(), Uncorrelated(), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:
