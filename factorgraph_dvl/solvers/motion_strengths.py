@@ -175,8 +175,8 @@ def _score(
         covariance[own] = with_constants[problem.key(name)]
     root = np.linalg.cholesky(np.linalg.inv(covariance))
     parts = []
-    for (rows, number, share), own in zip(shared, with_states, strict=False):
-        h = leverage_of(rows, own, with_constants, root, constants)
+    for (rows, number, share), with_own in zip(shared, with_states, strict=False):
+        h = leverage_of(rows, with_own, with_constants, root, constants)
         parts.append(SharedRows(rows, number, np.broadcast_to(share, number.shape), h))
     score = restricted_score(parts, len(strengths), information)
     gradient = log_determinant_gradient(

@@ -191,9 +191,9 @@ def log_determinant_gradient(
     sigma = np.sqrt(np.diag(information.covariance_of([every])))
     steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
     if with_states is None:
-        rows = list(problem.observation_rows(evaluation))
+        all_rows = list(problem.observation_rows(evaluation))
         given = information.given(constants)
-        with_states = by_place(rows, covariance_with_states(rows, given, constants))
+        with_states = by_place(all_rows, covariance_with_states(all_rows, given, constants))
 
     def total(p: Parameter, value: Array) -> float:
         every = problem.observation_rows_at(evaluation, {p.name: value})
@@ -202,9 +202,9 @@ def log_determinant_gradient(
 
     # By source: of the same rows, where the motion is that of the evaluation.
     known: dict[str, float] = {}
-    for rows, own in with_states.values():
-        product_ = float(np.vdot(_by_states(rows, constants), own))
-        known[rows.source] = known.get(rows.source, 0.0) + product_
+    for here, with_own in with_states.values():
+        total_here = float(np.vdot(_by_states(here, constants), with_own))
+        known[here.source] = known.get(here.source, 0.0) + total_here
 
     def before(p: Parameter, value: Array) -> float:
         if not problem.chain.interpolates:

@@ -101,9 +101,9 @@ def with_own_covariance(
     for own, matrix in parts:
         # What is not used need not be in the graph.
         used = np.flatnonzero(np.any(matrix, axis=(1, 2)))
-        numbers = [place.setdefault(tuple(k), len(place)) for k in own[used].tolist()]
-        order = np.argsort(numbers, kind="stable")
-        items.append((np.array(numbers, dtype=int)[order], used[order]))
+        groups = [place.setdefault(tuple(k), len(place)) for k in own[used].tolist()]
+        order = np.argsort(groups, kind="stable")
+        items.append((np.array(groups, dtype=int)[order], used[order]))
     for found, P in information.joint_in_parts(list(place)):
         for (_, matrix), (numbers, used), product_ in zip(parts, items, out, strict=True):
             first = np.searchsorted(numbers, found)

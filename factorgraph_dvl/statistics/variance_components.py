@@ -50,7 +50,7 @@ class NoiseFactor:
     @classmethod
     def of(cls, squares: float, freedom: float) -> NoiseFactor:
         """Return the factor of one component from squares of its residuals and their freedom."""
-        if freedom < _LEAST_REDUNDANCY:
+        if freedom < LEAST_REDUNDANCY:
             return cls(np.ones(1), np.array([freedom]))
         found = np.sqrt((squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM))
         return cls(np.array([max(found, LEAST_FACTOR)]), np.array([freedom]))
