@@ -148,7 +148,9 @@ class BoundObservation:
     def attached(self, parameters: Mapping[str, Array]) -> Any:
         """Return where measurements hang on the chain by clocks as they are."""
         shift = self.chain.shift(parameters)
-        return self.chain.attach(self.times(parameters), shift, turning=self.turning)
+        return self.chain.attach(
+            self.times(parameters), shift, turning=self.turning, before=self.attachment
+        )
 
     def attach(self, parameters: Mapping[str, Array]) -> None:
         """Attach measurements to the chain by clocks as they are."""

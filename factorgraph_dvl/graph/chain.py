@@ -195,7 +195,9 @@ class Chain(Protocol):
     def covers(self, time: Array) -> BoolArray:
         """Whether the motion is known at times (M,)."""
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Any:
+    def attach(
+        self, time: Array, shift: float = 0.0, *, turning: bool = False, before: Any = None
+    ) -> Any:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest.
 
         Parameters
@@ -207,6 +209,8 @@ class Chain(Protocol):
         turning : bool, default False
             Whether they hang between the nodes that their attitude is between, as measurements of
             attitude do, and those that move with the nodes.
+        before : object, optional
+            Where they hung.
         """
 
     def missing(self, at: Any, lin: Linearization) -> Array | None:

@@ -239,7 +239,14 @@ class InertialChain:
         """Return 0: attitudes are at the times of the nodes."""
         return 0.0
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> TwoWay:
+    def attach(
+        self,
+        time: Array,
+        shift: float = 0.0,
+        *,
+        turning: bool = False,
+        before: TwoWay | None = None,
+    ) -> TwoWay:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         return attach_two_way(self.segments, time, self.frame.earth_rate)
 

@@ -276,6 +276,25 @@ def factorized(
     return out, out.solution()
 
 
+def quickly_factorized(
+    problem: Problem, evaluation: Evaluation
+) -> tuple[SquareRootInformation, gtsam.VectorValues]:
+    """Return what `factorized` does, by Cholesky: from QR where that has no digits.
+
+    It takes a third of the time. Across a gap of a record it may lose digits: for what is
+    estimated again, not for the standard deviations of a result.
+    """
+    gaussian, ordering = problem.linearize(evaluation), problem.ordering()
+    try:
+        tree = gaussian.eliminateMultifrontal(ordering)
+    except RuntimeError:
+        return factorized(problem, evaluation)
+    del gaussian
+    problem.release()
+    out = SquareRootInformation([tree], evaluation.values.dims())
+    return out, out.solution()
+
+
 def quick_step(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> gtsam.VectorValues | None:

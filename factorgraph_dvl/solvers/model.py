@@ -15,7 +15,13 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.levenberg_marquardt import CONVERGED, Minimum, factorized, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import (
+    CONVERGED,
+    Minimum,
+    factorized,
+    minimise,
+    quickly_factorized,
+)
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.statistics.marginal_likelihood import constants_of, restricted_objective
 
@@ -291,7 +297,7 @@ def with_objective(
         # Where constants are at a maximum of their likelihood, the cost has none.
         evaluation = problem.weighed(problem.without_tilt(evaluation))
         tilt, problem.tilt = problem.tilt, None
-        information = factorized(problem, evaluation)[0]
+        information = (quickly_factorized if rough else factorized)(problem, evaluation)[0]
         problem.tilt = tilt
         model = replace(model, reference=(evaluation.states, evaluation.parameters))
     elif information is None:

@@ -115,6 +115,46 @@ def test_the_clock_of_attitudes_leaves_these_where_they_are(prepared, problem):
             assert changed.max() > 1e-4
 
 
+def test_a_clock_that_moves_fixes_past_nodes_makes_no_jump(prepared):
+    """Value and slope of the cost go on where fixes pass their nodes by little."""
+    chain, start = prepared.first_chain, prepared.values
+    rng = np.random.default_rng(2)
+    states = prepared.states.retracted(rng.normal(0.0, 1e-3, (prepared.states.p_n.shape[0], 12)))
+
+    def bound_at(late):
+        values = start | {chain.clock: start[chain.clock] + late}
+        return Problem(chain, prepared.observations, prepared.parameters, start=values)
+
+    (fixes,) = (b for b in bound_at(0.0).bound if b.observation.unit == "m")
+    node_time = chain.node_time
+    to_node = node_time[fixes.attachment.node + 1] - fixes.attachment.time
+    # From here on, some fixes pass a node.
+    edge = float(to_node[to_node > 1e-3].min())
+    before, after = bound_at(edge - 1e-3), bound_at(edge + 1e-3)
+    steps = edge + 1e-3 * np.array([-0.5, -0.25, 0.25, 0.5])
+
+    def costs(problem):
+        found = []
+        for late in steps:
+            values = problem.prior_values() | start | {chain.clock: start[chain.clock] + late}
+            evaluation = problem.evaluate(problem.values(states, values))
+            found.append(evaluation.cost)
+        return np.array(found)
+
+    evaluation = before.evaluate(before.values(states, before.prior_values() | start))
+    before.weigh(evaluation)
+    after.weigh(evaluation)
+    for problem in (before, after):
+        cost = costs(problem)
+        slopes = np.diff(cost) / np.diff(steps)
+        # A straight line through four points, but for what bends it over a millisecond.
+        bend = cost[1:3].sum() - cost[[0, 3]].sum()
+        assert abs(bend) < 1e-6 * cost[0]
+        np.testing.assert_allclose(slopes, slopes[1], rtol=0.05)
+    # There is a jump between the two: by whose nodes the fixes go on.
+    assert np.abs(costs(before) - costs(after)).min() > 1e-6 * costs(before)[0]
+
+
 def test_what_is_missing_half_way_by_hand(prepared):
     chain, k = prepared.first_chain, 5
     start, dt = chain.node_time[k], chain.node_time[k + 1] - chain.node_time[k]

@@ -224,7 +224,11 @@ def by_hand(c, x):
         noise_factors={},
         gain=0.0,
         chain=SimpleNamespace(interpolates=False, log_determinant=0.0),
-        bound=[SimpleNamespace(clocks={"another"})],
+        bound=[
+            SimpleNamespace(
+                clocks={"another"}, names={"c"}, observation=SimpleNamespace(label="y")
+            )
+        ],
         key=lambda name: C,
         log_sigma=lambda evaluation: [np.zeros(2)],
         observation_rows=lambda evaluation: rows(c),
@@ -250,6 +254,9 @@ def test_a_walk_measured_twice_by_hand(x):
     # That by a clock is left out.
     problem.bound[0].clocks = {"c"}
     assert not log_determinant_gradient(problem, evaluation, information).any()
+    problem.bound[0].clocks = {"another"}
+    again = log_determinant_gradient(problem, evaluation, information)
+    np.testing.assert_allclose(again, gradient, rtol=1e-9)
 
 
 def test_the_restricted_objective_of_the_walk_by_hand():
