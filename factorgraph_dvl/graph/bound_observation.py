@@ -108,6 +108,7 @@ class BoundObservation:
             self,
             observation=ObservationRows(whole, index) if own is None else own,
             chain=chain,
+            attachment=None,
             usable=self.usable[index],
             weight=self.weight[index],
             errors=None if errors is None else chain.errors(errors.parameters, errors.key_of),

@@ -123,7 +123,10 @@ def test_a_clock_that_moves_fixes_past_nodes_makes_no_jump(prepared):
 
     def bound_at(late):
         values = start | {chain.clock: start[chain.clock] + late}
-        return Problem(chain, prepared.observations, prepared.parameters, start=values)
+        problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
+        for bound in problem.bound:
+            bound.attach(problem.prior_values() | values)
+        return problem
 
     (fixes,) = (b for b in bound_at(0.0).bound if b.observation.unit == "m")
     node_time = chain.node_time

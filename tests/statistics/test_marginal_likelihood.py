@@ -72,7 +72,7 @@ def test_objectives_are_those_of_dense_matrices(name):
     problem, evaluation, information = system(name)
     states, every, rhs = dense(problem, evaluation)
     noise = 2.0 * sum(float(each.sum()) for each in problem.log_sigma(evaluation))
-    noise += priors(problem)
+    noise += priors(problem) + noise_of_the_imu(problem)
     if name == "walking biases":
         # Steps from node to node, of three axes each: per root hour, as segments last a second.
         steps = np.sqrt(np.diff(problem.chain.node_time) / 3600.0)
@@ -92,6 +92,13 @@ def priors(problem):
             # Stated of the rotation vector; det of the right Jacobian is 2 (1 - cos a) / a².
             out += 2.0 * np.log(2.0 * (1.0 - np.cos(angle)) / angle**2)
     return out
+
+
+def noise_of_the_imu(problem):
+    """Return log det of the noise of gyros and accelerometers, up to a constant: 3 and 6 rows."""
+    imu = problem.chain.imu
+    own = 3.0 * np.log(imu.gyro_noise_deg_sqrt_h) + 6.0 * np.log(imu.accel_noise_ug_sqrt_hz)
+    return 2.0 * problem.chain.count * own
 
 
 def sigma_of(problem, information):
@@ -155,7 +162,7 @@ def test_errors_that_persist_are_states():
     noise = 2.0 * sum(float(each.sum()) for each in problem.log_sigma(evaluation))
     # c_{j+1} = phi c_j + noise of variance 1 - phi².
     noise += sum(3 * 9 * np.log(-np.expm1(-2.0 / 5.0)) for _ in processes)
-    noise += priors(problem)
+    noise += priors(problem) + noise_of_the_imu(problem)
     expected = left(own, rhs) + log_determinant(own) + noise
     found = marginal_objective(problem, evaluation, information)
     assert found == pytest.approx(expected, rel=1e-9)
