@@ -52,14 +52,13 @@ def commands(root: Path, out: Path) -> dict[str, list[object]]:
     written = ["--out", out, "--no-figures"]
     reckon = ["deadreckon", root / "trial", "--quiet", *written, "--calibration"]
     return {
-        "instrument": ["instrument", root / "bad"],
         "crosscheck": ["crosscheck", root / "bad", root / "bad", *written],
         "deadreckon": [*reckon, root / "bad", "--attitude", "reference"],
         "attitude": [*reckon, root / "values.json", "--attitude", root / "bad"],
     }
 
 
-@pytest.mark.parametrize("name", ["instrument", "crosscheck", "deadreckon", "attitude"])
+@pytest.mark.parametrize("name", ["crosscheck", "deadreckon", "attitude"])
 def test_a_result_that_is_not_to_be_used_is_refused(
     name: str, folder: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -71,6 +70,19 @@ def test_a_result_that_is_not_to_be_used_is_refused(
     assert "--anyway" in refused.err
     assert not (tmp_path / "out").exists()
     assert REFUSAL not in run(*command, "--anyway").err
+
+
+def test_instrument_says_why_nothing_is_to_be_entered(folder: Path, run: Run) -> None:
+    refused = run("instrument", folder / "bad")
+    assert refused.code == 1
+    first, reason, *_ = refused.out.splitlines()
+    assert first == "# Verdict: do not use"
+    assert reason.startswith(f"#   error: {REASON}.")
+    assert all(line.startswith("#") for line in refused.out.splitlines())
+    shown = run("instrument", folder / "bad", "--anyway")
+    assert shown.code == 0
+    assert shown.out.startswith(refused.out)
+    assert "lever_arm_down_m: -1.000  # ± 0.010; positive: below; green" in shown.out
 
 
 def test_a_prior_that_is_not_to_be_used_is_refused(folder: Path, tmp_path: Path) -> None:

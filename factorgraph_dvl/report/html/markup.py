@@ -118,7 +118,7 @@ def described(table_: Table, *, label: str) -> Html:
 def _described(cell: DescribedCell) -> Cell:
     if isinstance(cell, Component):
         return component_cell(cell.name)
-    return grade_cell(cell.text) if isinstance(cell, Mark) else cell
+    return grade_cell(cell.text) if isinstance(cell, Mark) else both(cell)
 
 
 def component_cell(component: str) -> Html:
