@@ -231,7 +231,8 @@ def _solve_into(
         write_history,
     )
     from factorgraph_dvl.files.tables import write_table
-    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.trial_folder import files_of, inputs_of, load_trial
+    from factorgraph_dvl.report.html.content import maker_of
 
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
@@ -250,8 +251,9 @@ def _solve_into(
                 write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
             shown = history or along
+            run = run_of(trial, solution.steps, files_of(trial_path))
             series = None if shown is None else (shown.time, shown.names, shown.std)
-            write_report(folder, str(out), solution, run_of(trial, solution.steps), series)
+            write_report(folder, str(out), solution, run, series)
             if figures is not None:
                 with drawing():
                     _draw(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
@@ -259,7 +261,7 @@ def _solve_into(
         save_solution(solution, out, force=force, extra=add)
     _print_solution(trial, found, details=details)
     print_written(out)
-    print_conclusion(solution, "", out / REPORT_FILE)
+    print_conclusion(solution, maker_of(trial.certificate), out / REPORT_FILE)
     end_with(solution.verdict)
 
 
