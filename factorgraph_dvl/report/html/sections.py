@@ -12,7 +12,7 @@ from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
 from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments
 from factorgraph_dvl.analysis.information.marginals import marginals
-from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
+from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms
 from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
@@ -20,8 +20,8 @@ from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.notation import fixed, in_words, with_std
 from factorgraph_dvl.quality.texts import chinese_cause, component_names
 from factorgraph_dvl.quality.verdict import Verdict
-from factorgraph_dvl.report.entries import TITLE, conventions, entries_table
 from factorgraph_dvl.report.html.content import Result
+from factorgraph_dvl.report.html.entries import entries_content
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
@@ -82,7 +82,7 @@ def verdict_section(result: Result) -> Section:
     verdict = solution.verdict
     cells: list[Cell] = [verdict_box(verdict)]
     if has_instrument_terms(solution):
-        cells += _entries(result)
+        cells += entries_content(result)
     elif main := [e for e in solution.estimates if e.name in solution.limits]:
         shown = calibration_table(replace(solution, estimates=tuple(main))).brief()
         cells.append(element("h3", both("What was found")))
@@ -94,17 +94,6 @@ def verdict_section(result: Result) -> Section:
     if notes:
         cells.append(folded("Notes", items([joined(_what(f), _code(f)) for f in notes])))
     return section("Verdict", *cells, key="verdict")
-
-
-def _entries(result: Result) -> Iterator[Html]:
-    """Yield what to enter in the DVL, or that there is nothing to enter."""
-    yield element("h3", both(TITLE))
-    if result.solution.verdict.grade == "do not use":
-        yield paragraph(both("Enter nothing: this result must not be used."))
-        return
-    terms = instrument_of(result.solution)
-    yield described(entries_table(terms, result.maker), label=TITLE)
-    yield paragraph(joined(*map(both, conventions(terms))))
 
 
 def verdict_box(verdict: Verdict) -> Html:
