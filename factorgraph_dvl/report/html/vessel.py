@@ -29,7 +29,7 @@ from factorgraph_dvl.solution import Solution
 # Size of each drawing, and what is left free around the instruments, in its own units.
 _SIZE, _MARGIN = 360.0, 118.0
 # Length of the DVL's axes and beams, in units of the drawing. Chosen: their directions are seen.
-_AXIS, _BEAM = 62.0, 84.0
+_AXIS, _BEAM = 54.0, 76.0
 # Beams of a Janus DVL, by direction from its axis and from ahead, deg.
 _SLANT, _AZIMUTHS = 30.0, (45.0, 135.0, 225.0, 315.0)
 # Points that are closer have one label, in units of the drawing.
@@ -136,8 +136,8 @@ def _view(view: Array, places: Sequence[_Place], axes: Array, title: str) -> Htm
         ),
         f'<path class="arm" d="M{_xy(at[0])} L{_xy(at[-1])}"/>',
         *_dvl(at[-1], view, axes),
-        *(f'<circle class="point" cx="{x:.1f}" cy="{y:.1f}" r="4"/>' for x, y in at),
         *_names(at, [p.name for p in places], -(view @ axes.sum(axis=1)) * [1.0, -1.0]),
+        *(f'<circle class="point" cx="{x:.1f}" cy="{y:.1f}" r="4"/>' for x, y in at),
         _ruler(span, scale),
         "</svg>",
     ]

@@ -45,7 +45,7 @@ def axis(view: str, k: int) -> np.ndarray | None:
     if found is None:
         return None
     start, end = (np.array(text.split(","), dtype=float) for text in found.groups())
-    return (end - start) / 62.0
+    return (end - start) / 54.0
 
 
 def test_places_are_to_scale() -> None:
@@ -91,4 +91,4 @@ def test_beams_are_on_the_side_on_which_the_dvl_looks() -> None:
         beams = re.findall(r'class="beam" d="M[\d.]+,([\d.]+) L[\d.]+,([\d.]+)"', side)
         assert len(beams) == 4
         for start, end in beams:
-            assert float(end) - float(start) == pytest.approx(down * 84.0 * 0.866, abs=0.2)
+            assert float(end) - float(start) == pytest.approx(down * 76.0 * 0.866, abs=0.2)
