@@ -33,6 +33,7 @@ ELSEWHERE = {
     "graph/clocks": "solvers/test_clocks.py",
     "graph/imu_errors": "graph/test_problem.py",
     "graph/processes": "solvers/test_correlated_noise.py",
+    "imu/between_samples": "imu/test_two_way.py",
     "imu/attitude_record": "solvers/test_preparation_without_imu.py",
     "initialization/record_clocks": "solvers/test_preparation_without_imu.py",
     "initialization/track_velocity": "solvers/test_preparation_without_imu.py",
