@@ -46,6 +46,7 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.certificate import CertificateSettings
+from factorgraph_dvl.settings.convert import from_plain
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.trial import (
     Reference,
@@ -380,13 +381,20 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
         },
         limits=_limits(trial),
         certificate=(
-            msgspec.convert(trial.certificate, CertificateSettings) if trial.certificate else UNSET
+            from_plain(dict(trial.certificate), CertificateSettings)
+            if trial.certificate
+            else UNSET
         ),
         initial=initial_settings(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
+
+
+def _certificate(trial: Trial) -> CertificateSettings | msgspec.UnsetType:
+    stated = dict(trial.certificate)
+    return from_plain(stated, CertificateSettings) if stated else UNSET
 
 
 def _limits(trial: Trial) -> LimitSettings | msgspec.UnsetType:

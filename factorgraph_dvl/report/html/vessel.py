@@ -27,7 +27,7 @@ from factorgraph_dvl.sensors.gnss import LEVER_ARM as GNSS_LEVER_ARM
 from factorgraph_dvl.solution import Solution
 
 # Size of each drawing, and what is left free around the instruments, in its own units.
-_SIZE, _MARGIN = 360.0, 118.0
+_SIZE, _MARGIN = 360.0, 124.0
 # Length of the DVL's axes and beams, in units of the drawing. Chosen: their directions are seen.
 _AXIS, _BEAM = 54.0, 76.0
 # Beams of a Janus DVL, by direction from its axis and from ahead, deg.
@@ -156,8 +156,8 @@ def _dvl(at: Array, view: Array, axes: Array) -> Iterator[str]:
     for k, name in enumerate(("forward", "starboard", "down")):
         seen = (view @ axes[:, k]) * [1.0, -1.0]
         length = float(np.hypot(*seen))
-        # An axis that points at the reader is a point.
-        if length < 0.15:
+        # An axis that points nearly at the reader hides behind its point.
+        if length < 0.25:
             continue
         end = at + _AXIS * seen
         along, across = seen / length, np.array([-seen[1], seen[0]]) / length
@@ -182,10 +182,10 @@ def _names(at: Array, names: Sequence[str], free: Array) -> Iterator[str]:
         near = [n for other, n in done if np.hypot(*(xy - other)) < _APART]
         line = max(near, default=-1) + 1
         done.append((xy, line))
-        away = free if name == "DVL" else xy - at.mean(axis=0)
-        right = away[0] >= 0.0
+        side = free if name == "DVL" else xy - at.mean(axis=0)
+        right = side[0] >= 0.0
         x = xy[0] + (9.0 if right else -9.0)
-        y = xy[1] + (16.0 if away[1] >= 0.0 else -8.0) + 15.0 * line
+        y = xy[1] + (16.0 if side[1] >= 0.0 else -8.0) + 15.0 * line
         anchor = "start" if right else "end"
         yield (
             f'<text class="place" text-anchor="{anchor}" x="{x:.1f}" y="{y:.1f}">'
