@@ -32,7 +32,7 @@ def print_verdict(solution: Solution) -> None:
 
 
 # Reasons of a verdict that are printed at the end. Chosen: they leave room for the values.
-_REASONS = 4
+_REASONS = 3
 
 
 def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
