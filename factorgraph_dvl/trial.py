@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from msgspec import UnsetType
@@ -152,6 +152,8 @@ class Trial:
         What was noticed while loading, for the user.
     limits : mapping of str to float, optional
         Standard deviations that are good enough, by parameter, in reported units.
+    certificate : mapping of str to object, optional
+        What the page prints of vessel, place and instruments, as `certificate` of trial.yaml.
 
     Examples
     --------
@@ -178,6 +180,7 @@ class Trial:
     calibration_truth: dict[str, Array] = field(default_factory=dict)
     notes: tuple[Finding, ...] = ()
     limits: Mapping[str, float] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
+    certificate: Mapping[str, Any] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         counts = [] if self.imu is None else [f"imu {self.imu.time.size}"]

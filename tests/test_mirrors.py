@@ -38,6 +38,7 @@ ELSEWHERE = {
     "initialization/record_clocks": "solvers/test_preparation_without_imu.py",
     "initialization/track_velocity": "solvers/test_preparation_without_imu.py",
     "replay/update": "replay/test_record.py",
+    "settings/certificate": "report/html/test_certificate.py",
     "statistics/information_history": "analysis/information/test_shares.py",
     "statistics/leverage": "statistics/test_rows.py",
     "statistics/spurious_information": "replay/test_session.py",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -13,6 +13,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.verdict import Grade, grades
 from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION
 from factorgraph_dvl.solution import Calibration, Solution
@@ -35,6 +36,12 @@ class Angles:
 
     value: Array
     std: Array
+    grade: tuple[Grade, ...]
+
+
+# What lever arms start from: the first of these records that a trial has, else the antenna.
+ORIGINS = {"imu": "IMU", "ins": "INS"}
+ANTENNA = "GNSS antenna"
 
 
 @dataclass(frozen=True)
@@ -47,8 +54,16 @@ class InstrumentTerms:
         Angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d, by order.
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
+    scale_grade : tuple of Grade
+        Of each scale error.
     lever_arm, lever_arm_std : ndarray, shape (3,)
-        IMU to DVL, forward, starboard, down, m.
+        `origin` to DVL, forward, starboard, down, m.
+    lever_arm_covariance : ndarray, shape (3, 3), m²
+        Of `lever_arm`.
+    lever_arm_grade : tuple of Grade
+        Of its components.
+    origin : str
+        Where the lever arm starts: `IMU`, `INS` or `GNSS antenna`.
     alignment : ndarray, shape (3,)
         TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates for d, C_b^d =
         Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
@@ -63,11 +78,20 @@ class InstrumentTerms:
     body_to_dvl: dict[Order, Angles]
     scale_error: Array
     scale_std: Array
+    scale_grade: tuple[Grade, ...]
     lever_arm: Array
     lever_arm_std: Array
+    lever_arm_covariance: Array
+    lever_arm_grade: tuple[Grade, ...]
+    origin: str
     alignment: Array
     alignment_std: Array
     axes: Array
+
+
+def has_instrument_terms(calibration: Calibration | Solution) -> bool:
+    """Return whether a calibration is that of a DVL, with mounting, scale and lever arm."""
+    return set(NEEDED) <= {e.name for e in calibration.estimates}
 
 
 def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
@@ -94,6 +118,8 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
                 "CALIBRATION --out DIR" if beams else "",
             )  # fmt: skip
     alpha, covariance = parts[MISALIGNMENT]
+    seen = next(e.observable for e in calibration.estimates if e.name == MISALIGNMENT)
+    limit = calibration.limits.get(MISALIGNMENT, np.inf)
     frd = frd_from_body(calibration.body_axes)
     # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.
     trdi = frd_from_body("RFU")
@@ -105,7 +131,10 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         J = np.stack(
             [wrapped((of(alpha + h) - of(alpha - h)) * DEG) / DEG for h in steps], axis=1
         ) / (2.0 * _STEP)
-        return Angles(value, np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0)))
+        std = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
+        # An angle is as observable as the component that adds most to its standard deviation.
+        most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
+        return Angles(value, std, grades(std, seen[most], limit))
 
     def rpy(order: Order, *, inverse: bool) -> Angles:
         def of(vector: Array) -> Array:
@@ -120,18 +149,32 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
 
     alignment = angles(trdi_angles)
     lever_arm, lever_covariance = parts[LEVER_ARM]
+    lever_covariance = frd @ lever_covariance @ frd.T
+    graded = calibration.grades
     scale, scale_covariance = parts[SCALE_ERROR]
     return InstrumentTerms(
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
         scale_error=scale,
         scale_std=np.sqrt(np.diag(scale_covariance)),
+        scale_grade=graded[SCALE_ERROR],
         lever_arm=frd @ lever_arm,
-        lever_arm_std=np.sqrt(np.diag(frd @ lever_covariance @ frd.T)),
+        lever_arm_std=np.sqrt(np.diag(lever_covariance)),
+        lever_arm_covariance=lever_covariance,
+        lever_arm_grade=tuple(graded[LEVER_ARM][i] for i in np.argmax(np.abs(frd), axis=1)),
+        origin=_origin(calibration.inputs),
         alignment=alignment.value,
         alignment_std=alignment.std,
         axes=exp_so3(alpha * DEG) @ frd.T,
     )
+
+
+def _origin(inputs: Sequence[str]) -> str:
+    """Return where lever arms start, from the fingerprints of the records of a trial."""
+    sections = {text.partition(":")[0] for text in inputs}
+    known = next((name for section, name in ORIGINS.items() if section in sections), None)
+    # Without fingerprints, records are unknown, and body quantities start from the IMU.
+    return known or (ANTENNA if sections else ORIGINS["imu"])
 
 
 def euler(matrix: Array, order: Order) -> Array:

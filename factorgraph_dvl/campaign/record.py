@@ -12,11 +12,9 @@ import msgspec
 
 from factorgraph_dvl import __version__
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.run_file import hash_of
 from factorgraph_dvl.settings.convert import from_json
-from factorgraph_dvl.settings.files import MEGABYTE, open_file, read_bytes
-
-# Bytes that are read at once for a fingerprint.
-_BLOCK = 1 << 20
+from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 
 
 class RunRecord(msgspec.Struct, kw_only=True):
@@ -100,16 +98,4 @@ def fingerprint_of(files: Iterable[Path], options: Mapping[str, str]) -> str:
         total.update(f"\0{name}\0{value}".encode())
     for file in files:
         total.update(f"\0{file.name}\0{hash_of(file)}".encode())
-    return total.hexdigest()
-
-
-def hash_of(path: Path) -> str:
-    """Return the SHA-256 of a file; empty if there is none that can be read."""
-    total = hashlib.sha256()
-    try:
-        with open_file(path, expected="a file") as file:
-            while block := file.read(_BLOCK):
-                total.update(block)
-    except (DataError, OSError):
-        return ""
     return total.hexdigest()

@@ -19,12 +19,12 @@ from msgspec import UnsetType
 from factorgraph_dvl.campaign.record import (
     RunRecord,
     fingerprint_of,
-    hash_of,
     read_record,
     write_record,
 )
 from factorgraph_dvl.errors import FactorgraphDvlError, as_text
 from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE, load_calibration
+from factorgraph_dvl.files.run_file import hash_of
 from factorgraph_dvl.files.trial_folder import files_of, locate
 from factorgraph_dvl.files.trial_yaml import TrialSettings
 from factorgraph_dvl.sensors.dvl import CALIBRATED, DvlSettings

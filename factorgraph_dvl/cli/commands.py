@@ -113,7 +113,7 @@ COMMANDS = {
     ),
     "instrument": (
         "instrument.instrument",
-        "Print a calibration in the terms of instruments: angles, %, ppm, TRDI's EA and EI.",
+        "Print a calibration in the form your instrument expects, with its verdict.",
     ),
     "correct": (
         "correct.correct",

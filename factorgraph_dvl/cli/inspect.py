@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import typer
+
 from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import print_table, say, stdout
+from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.cli.options import TrialPath
 
 if TYPE_CHECKING:
@@ -36,6 +39,8 @@ def errors_in(trial: Trial, *, anyway: bool) -> tuple[Finding, ...]:
 def inspect(trial_path: TrialPath) -> None:
     """Show the records of a trial, and check their units and signs.
 
+    Errors come last, with their number, and end with exit code 1.
+
     Examples:
       factorgraph-dvl inspect data/seed-a-phase-90
     """
@@ -48,13 +53,19 @@ def inspect(trial_path: TrialPath) -> None:
     assumed = [] if trial.imu is None else imu_lines(trial.imu.settings)
     console = stdout()
     print_table(sensor_table(result), "longest s", "from s")
-    for line in (motion_line(result), *assumed):
-        console.print(line, markup=False, soft_wrap=True)
+    for text in (motion_line(result), *assumed):
+        console.print(text, markup=False, soft_wrap=True)
     for note in trial.notes:
         say(note)
+    errors = [f for f in result.findings if f.severity == "error"]
+    findings = (*(f for f in result.findings if f.severity != "error"), *errors)
     if events.active():
-        for each in result.findings:
+        for each in findings:
             say(each)
-        return
-    for finding in finding_lines(result):
-        console.print(finding, soft_wrap=True)
+    else:
+        for line in finding_lines(findings):
+            console.print(line, soft_wrap=True)
+        if errors:
+            console.print(f"Errors: {len(errors)}. These records cannot be used.", markup=False)
+    if errors:
+        raise typer.Exit(NO_RESULT)

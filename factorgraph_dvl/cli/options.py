@@ -37,6 +37,10 @@ Rate = Annotated[
 Anyway = Annotated[
     bool, typer.Option("--anyway", help="Use records and calibrations that would be refused.")
 ]
+Details = Annotated[
+    bool,
+    typer.Option("--details", help="Also print all parameters and the error budget."),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Do not show progress.")]
 
 # Output folders of the running command; released when it ends.

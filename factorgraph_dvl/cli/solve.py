@@ -22,6 +22,7 @@ from factorgraph_dvl.cli.console import (
 from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
+    Details,
     FigureKind,
     Figures,
     Force,
@@ -33,7 +34,7 @@ from factorgraph_dvl.cli.options import (
     claim_output,
 )
 from factorgraph_dvl.cli.report import write_report
-from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
+from factorgraph_dvl.cli.verdict import end_with, print_conclusion, print_notes
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -95,6 +96,7 @@ def solve(
     resume: Annotated[
         bool, typer.Option("--resume", help="Without effect: a run starts from the beginning.")
     ] = False,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Estimate calibration and trajectory from all data of a trial.
@@ -126,6 +128,7 @@ def solve(
         force=force,
         figures=None if no_figures else figures,
         anyway=anyway,
+        details=details,
         quiet=quiet,
     )
 
@@ -148,6 +151,7 @@ def kalman(
     figures: Figures = FigureKind.PNG,
     rate: Rate = 10.0,
     anyway: Anyway = False,
+    details: Details = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate or navigate with a Kalman filter, for comparison with `solve`.
@@ -179,6 +183,7 @@ def kalman(
         force=force,
         figures=None if no_figures else figures,
         anyway=anyway,
+        details=details,
         quiet=quiet,
     )
 
@@ -212,6 +217,7 @@ def _solve_into(
     force: bool,
     figures: FigureKind | None,
     anyway: bool,
+    details: bool,
     quiet: bool,
 ) -> None:
     """Load a trial, run a solver, write and show its solution."""
@@ -220,11 +226,13 @@ def _solve_into(
         FIGURES_FOLDER,
         HALVES_FILE,
         OWNED,
+        REPORT_FILE,
         save_solution,
         write_history,
     )
     from factorgraph_dvl.files.tables import write_table
-    from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
+    from factorgraph_dvl.files.trial_folder import files_of, inputs_of, load_trial
+    from factorgraph_dvl.report.html.content import maker_of
 
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
     with ProgressLine(quiet=quiet) as progress:
@@ -243,15 +251,17 @@ def _solve_into(
                 write_table(folder / HALVES_FILE, found.halves.columns())
             write_instrument(solution, folder)
             shown = history or along
+            run = run_of(trial, solution.steps, files_of(trial_path))
             series = None if shown is None else (shown.time, shown.names, shown.std)
-            write_report(folder, str(out), solution, run_of(trial, solution.steps), series)
+            write_report(folder, str(out), solution, run, series)
             if figures is not None:
                 with drawing():
                     _draw(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
 
         save_solution(solution, out, force=force, extra=add)
-    _print_solution(trial, found)
+    _print_solution(trial, found, details=details)
     print_written(out)
+    print_conclusion(solution, maker_of(trial.certificate), out / REPORT_FILE)
     end_with(solution.verdict)
 
 
@@ -297,17 +307,16 @@ def write_beams(trial: Trial, solution: Solution, folder: Path) -> None:
 
 def write_instrument(solution: Solution, folder: Path) -> None:
     """Write the calibration of a DVL in the terms of instruments, if it can be used."""
-    from factorgraph_dvl.analysis.instrument_terms import NEEDED, instrument_of
+    from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms
     from factorgraph_dvl.files.solution_folder import INSTRUMENT_FILE
     from factorgraph_dvl.report.files.instrument import instrument_text
 
-    usable = solution.verdict.grade != "do not use"
-    if usable and set(NEEDED) <= {e.name for e in solution.estimates}:
-        text = instrument_text(instrument_of(solution), solution.trial)
-        (folder / INSTRUMENT_FILE).write_text(text, encoding="utf-8")
+    if solution.verdict.grade != "do not use" and has_instrument_terms(solution):
+        (folder / INSTRUMENT_FILE).write_text(instrument_text(solution), encoding="utf-8")
 
 
-def _print_solution(trial: Trial, found: _Found) -> None:
+def _print_solution(trial: Trial, found: _Found, *, details: bool) -> None:
+    """Print what the conclusion does not show; all parameters and causes with `details`."""
     from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
     from factorgraph_dvl.report.tables import (
         calibration_table,
@@ -318,12 +327,14 @@ def _print_solution(trial: Trial, found: _Found) -> None:
     )
 
     solution = found.solution
-    print_verdict(solution)
     truth = trial.calibration_truth
     if solution.estimates:
+        shown = solution if details else _main(solution)
         errors = calibration_errors(solution, truth) if truth else None
-        print_table(calibration_table(solution, known_errors(errors)))
-        print_error_budget(solution)
+        if shown.estimates:
+            print_table(calibration_table(shown, known_errors(errors)))
+        if details:
+            print_error_budget(solution)
         accuracy = paper_accuracy(solution.estimates, truth)
         if isfinite(accuracy):
             text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "
@@ -334,4 +345,18 @@ def _print_solution(trial: Trial, found: _Found) -> None:
         print_table(hypothesis_table(solution))
     if solution.rejected:
         stdout().print(rejected_line(solution), markup=False, soft_wrap=True)
-    print_findings(solution)
+    print_notes(solution)
+
+
+def _main(solution: Solution) -> Solution:
+    """Return a solution with the parameters that are printed without being asked for.
+
+    Those of a DVL are among the values to enter, unless it must not be used. Of another
+    calibration, they are those that have a limit; all of them, if none has.
+    """
+    from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms
+
+    if has_instrument_terms(solution):
+        return replace(solution, estimates=())
+    limited = tuple(e for e in solution.estimates if e.name in solution.limits)
+    return replace(solution, estimates=limited or solution.estimates)

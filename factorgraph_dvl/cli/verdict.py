@@ -8,11 +8,13 @@ import typer
 from rich.text import Text
 
 from factorgraph_dvl.cli import events
-from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
+from factorgraph_dvl.cli.console import found_event, print_table, say, stderr, stdout
 from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
@@ -29,12 +31,50 @@ def print_verdict(solution: Solution) -> None:
     stdout().print(verdict_line(verdict), soft_wrap=True)
 
 
+# Reasons of a verdict that are printed at the end. Chosen: they leave room for the values.
+_REASONS = 3
+
+
+def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
+    """Print what matters, last: verdict, its reasons, the values to enter, the page.
+
+    Parameters
+    ----------
+    solution : Solution
+        What was found.
+    maker : str
+        Maker of the DVL, empty if not known.
+    page : Path
+        Of the result.
+    """
+    from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
+    from factorgraph_dvl.report.entries import entries_table
+
+    print_verdict(solution)
+    reasons = solution.verdict.reasons[1:]
+    if not events.active():
+        for reason in reasons[: _REASONS - 1]:
+            stdout().print(f"{reason.severity}: {reason}", markup=False, soft_wrap=True)
+        if len(reasons) >= _REASONS:
+            count = len(reasons) + 1 - _REASONS
+            stdout().print(f"Further reasons on the page: {count}", markup=False)
+    if solution.verdict.grade != "do not use" and has_instrument_terms(solution):
+        print_table(entries_table(instrument_of(solution), maker), "unit")
+    if not events.active():
+        stdout().print(f"Open {page}", markup=False, soft_wrap=True)
+
+
 def print_findings(solution: Solution) -> None:
     """Print the reasons of the verdict, then notes that tables do not show."""
-    from factorgraph_dvl.quality.finding import Code
-
     for reason in solution.verdict.reasons:
         say(reason)
+    print_notes(solution)
+
+
+def print_notes(solution: Solution) -> None:
+    """Print notes that tables do not show."""
+    from factorgraph_dvl.quality.finding import Code
+
     for note in solution.findings:
         # A parameter that no limit is for is grey in the table, and nobody's trouble.
         aside = note.code == Code.NOT_OBSERVABLE and note.parameter not in solution.limits

@@ -23,7 +23,7 @@ from factorgraph_dvl.quality.finding import Code, Finding, Severity
 from factorgraph_dvl.quality.texts import decoded
 from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, Grade, VerdictGrade
 from factorgraph_dvl.sensors.catalogue import specs_of
-from factorgraph_dvl.sensors.dvl import CALIBRATED
+from factorgraph_dvl.sensors.dvl import CALIBRATED, MISALIGNMENT
 from factorgraph_dvl.sensors.fingerprint import PATTERN
 from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
@@ -38,6 +38,11 @@ _CODES = {str(code): code for code in Code}
 _MAX_BYTES = 64 * MEGABYTE
 # Of a variance, for files with few digits.
 _ROUNDING = 0.02
+# What readers of the file would else take for roll, pitch and yaw.
+_CONVENTIONS = {
+    MISALIGNMENT: "rotation vector from body to DVL, in the body axes; it is not roll, pitch and "
+    "yaw: instrument.yaml has those to enter"
+}
 # JSON knows no nan: null stands for it.
 _Numbers = list[float | None]
 _Entries = list[float | _Numbers | None]
@@ -113,6 +118,7 @@ class _File(msgspec.Struct):
     error_budget: list[_Cause] = []
     epoch: str = ""
     span_s: tuple[float, float] | None = None
+    conventions: dict[str, str] = {}
 
     def __post_init__(self) -> None:
         check_epoch(self.epoch)
@@ -325,6 +331,9 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
         ],
         epoch=solution.epoch,
         span_s=solution.span,
+        conventions={
+            e.name: _CONVENTIONS[e.name] for e in solution.estimates if e.name in _CONVENTIONS
+        },
     )
     # msgspec writes nan and infinity as null, and every float with the digits it takes.
     return msgspec.json.format(msgspec.json.encode(calibration), indent=2) + b"\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 from collections.abc import Sequence
@@ -12,16 +13,18 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import DataError, as_text
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.convert import from_json
-from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.settings.files import MEGABYTE, open_file, read_bytes
 from factorgraph_dvl.solution import SolverStep
 from factorgraph_dvl.trial import Trial
 
 RUN_FILE = "run.json"
 # Settings of some dozen sensors, with the places of beacons.
 _MAX_BYTES = 16 * MEGABYTE
+# Bytes that are read at once for a hash.
+_BLOCK = MEGABYTE
 # Packages that numbers depend on.
 _PACKAGES = ("factorgraph-dvl", "gtsam", "numpy", "scipy")
 
@@ -35,6 +38,13 @@ class Inventory(msgspec.Struct):
     to_s: float
     interval_s: float
     longest_interval_s: float
+
+
+class InputFile(msgspec.Struct):
+    """A file that a trial was read from."""
+
+    name: str
+    sha256: str
 
 
 class StepTaken(msgspec.Struct):
@@ -57,9 +67,11 @@ class Run(msgspec.Struct):
     records: list[Inventory]
     truth: dict[str, Any] = {}
     steps: list[StepTaken] = []
+    certificate: dict[str, Any] = {}
+    files: list[InputFile] = []
 
 
-def run_of(trial: Trial, steps: Sequence[SolverStep] = ()) -> Run:
+def run_of(trial: Trial, steps: Sequence[SolverStep] = (), files: Sequence[Path] = ()) -> Run:
     """Return what a solution of a trial comes from.
 
     Parameters
@@ -68,6 +80,8 @@ def run_of(trial: Trial, steps: Sequence[SolverStep] = ()) -> Run:
         The trial, as loaded.
     steps : sequence of SolverStep, optional
         What its solver changed of its assumptions.
+    files : sequence of Path, optional
+        What the trial was read from.
     """
     records: list[Any] = list(trial.records)
     versions = {"python": platform.python_version()}
@@ -82,6 +96,8 @@ def run_of(trial: Trial, steps: Sequence[SolverStep] = ()) -> Run:
             StepTaken(i, s.change, s.objective, s.fall, s.largest_move_sigma)
             for i, s in enumerate(steps)
         ],
+        certificate=dict(trial.certificate),
+        files=[InputFile(as_text(file.name), hash_of(file)) for file in files],
     )
 
 
@@ -95,6 +111,18 @@ def _inventory(section: str, time: Array) -> Inventory:
         interval_s=float(np.median(intervals)),
         longest_interval_s=float(intervals.max()),
     )
+
+
+def hash_of(path: Path) -> str:
+    """Return the SHA-256 of a file; empty if there is none that can be read."""
+    total = hashlib.sha256()
+    try:
+        with open_file(path, expected="a file") as file:
+            while block := file.read(_BLOCK):
+                total.update(block)
+    except (DataError, OSError):
+        return ""
+    return total.hexdigest()
 
 
 def encode_run(run: Run) -> bytes:

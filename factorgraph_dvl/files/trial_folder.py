@@ -45,6 +45,8 @@ from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
+from factorgraph_dvl.settings.certificate import CertificateSettings
+from factorgraph_dvl.settings.convert import from_plain
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
 from factorgraph_dvl.trial import (
     Reference,
@@ -157,6 +159,9 @@ def assembled(
         initial_velocity=None if initial is UNSET else velocity_of(initial),
         reference=_reference_of(tables, settings),
         notes=tuple(notes),
+        certificate=(
+            {} if settings.certificate is UNSET else msgspec.to_builtins(settings.certificate)
+        ),
         limits={**DEFAULT_LIMITS, **({} if settings.limits is UNSET else settings.limits.stated)},
     )
 
@@ -375,11 +380,21 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
             for record in trial.records
         },
         limits=_limits(trial),
+        certificate=(
+            from_plain(dict(trial.certificate), CertificateSettings)
+            if trial.certificate
+            else UNSET
+        ),
         initial=initial_settings(trial),
         reference=(
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
+
+
+def _certificate(trial: Trial) -> CertificateSettings | msgspec.UnsetType:
+    stated = dict(trial.certificate)
+    return from_plain(stated, CertificateSettings) if stated else UNSET
 
 
 def _limits(trial: Trial) -> LimitSettings | msgspec.UnsetType:

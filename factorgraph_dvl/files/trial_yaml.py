@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.catalogue import AIDS, PLANAR, aid_types, load_plug_ins
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorSection
+from factorgraph_dvl.settings.certificate import CertificateSettings
 from factorgraph_dvl.settings.sections import Positive, Section, Sigma3, check_epoch
 from factorgraph_dvl.settings.yaml_file import dump_yaml, parse_yaml
 
@@ -80,6 +81,7 @@ class _Settings(Section, frozen=True, kw_only=True):
     noise: NoiseModel | UnsetType = UNSET
     imu: ImuSettings | UnsetType = UNSET
     limits: LimitSettings | UnsetType = UNSET
+    certificate: CertificateSettings | UnsetType = UNSET
     initial: InitialSettings | UnsetType = UNSET
     reference: ReferenceSettings | UnsetType = UNSET
 

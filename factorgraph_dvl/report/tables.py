@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 
 import numpy as np
@@ -17,6 +17,7 @@ from factorgraph_dvl.analysis.information.marginals import Marginals
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.plausibility.survey import Survey
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.notation import at_precision, fixed, split_unit, with_std
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.table import Cell, Component, Mark, Table, unit_of
@@ -277,11 +278,9 @@ def imu_lines(settings: ImuSettings) -> list[str]:
     ]
 
 
-def finding_lines(survey: Survey) -> list[Text]:
+def finding_lines(findings: Iterable[Finding]) -> list[Text]:
     """Return a line for each finding."""
-    return [
-        Text.assemble((f"{f.severity}: ", STYLES[f.severity]), str(f)) for f in survey.findings
-    ]
+    return [Text.assemble((f"{f.severity}: ", STYLES[f.severity]), str(f)) for f in findings]
 
 
 # Causes that are shown of each component. Chosen: they make up nearly all of it.

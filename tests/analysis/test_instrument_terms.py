@@ -107,7 +107,7 @@ def test_standard_deviations_are_those_of_the_angles():
 
 
 def test_text_is_yaml_and_states_the_commands():
-    text = instrument_text(instrument_of(calibrated([0.0, 0.0, 16.45])), "cruise")
+    text = instrument_text(calibrated([0.0, 0.0, 16.45]))
     data = yaml.safe_load(text)
     assert data["trdi"] == {"EA": 1645, "EI": 0, "EJ": 0}
     assert "EA+01645" in text
@@ -119,12 +119,12 @@ def test_text_is_yaml_and_states_the_commands():
 
 def test_axes_that_cannot_be_trdi_s_are_named():
     for body_axes, said in (("RFU", False), ("FRD", True)):
-        text = instrument_text(instrument_of(calibrated([0.0, 0.0, 45.0], body_axes)), "a trial")
+        text = instrument_text(calibrated([0.0, 0.0, 45.0], body_axes))
         assert ("DO NOT TYPE IN" in text) == said
 
 
 def test_half_a_turn_is_within_the_range_of_the_command():
-    text = instrument_text(instrument_of(calibrated([0.0, 0.0, -180.0])), "cruise")
+    text = instrument_text(calibrated([0.0, 0.0, -180.0]))
     assert yaml.safe_load(text)["trdi"]["EA"] == 18000
 
 
@@ -137,7 +137,7 @@ def test_a_calibration_without_a_dvl_is_refused():
 def test_each_maker_s_numbers_give_the_mounting_back_by_its_rule(body_axes):
     """A velocity of the ship goes through the mounting, and comes back by the typed numbers."""
     alpha = frd_from_body(body_axes).T @ np.array([1.2, -2.3, 31.0])
-    text = instrument_text(instrument_of(calibrated(alpha.tolist(), body_axes)), "cruise")
+    text = instrument_text(calibrated(alpha.tolist(), body_axes))
     data = yaml.safe_load(text)
     frd = frd_from_body(body_axes)
     C_db = frd @ exp_so3(alpha * DEG).T @ frd.T  # d to b, forward, starboard, down
@@ -167,7 +167,7 @@ def test_each_maker_s_numbers_give_the_mounting_back_by_its_rule(body_axes):
 def test_trdi_s_commands_of_the_text_turn_a_ship_s_velocity_into_the_instrument_s():
     alpha = np.array([1.2, -2.3, 31.0])
     # The instrument's axes: X to starboard, Y (beam 3) ahead, Z up, as RFU.
-    text = instrument_text(instrument_of(calibrated(alpha.tolist(), "RFU")), "cruise")
+    text = instrument_text(calibrated(alpha.tolist(), "RFU"))
     EA, EI, EJ = (0.01 * yaml.safe_load(text)["trdi"][name] * DEG for name in ("EA", "EI", "EJ"))
     ship = np.array([0.3, 2.0, 0.1])
     # By the commands' rule, in forward, starboard, down.

@@ -74,8 +74,9 @@ def test_solve_writes_a_solution_and_shows_it(
     for name in ("calibration.json", "trajectory.csv", "track.png"):
         assert name in result.out
     reason = "misalignment_z_deg (±4) above the limit of 0.1 deg"
-    assert result.out.startswith(f"Verdict: doubtful: {reason}. {Code.UNCERTAIN.action}")
-    assert f"warning: {reason}" in result.err
+    verdict, last = result.out.splitlines()[-2:]
+    assert verdict == f"Verdict: doubtful: {reason}. {Code.UNCERTAIN.action}"
+    assert last == f"Open {out}/report.html"
     assert "note: misalignment_z_deg was not observable" in result.err
     # Nothing is drawn over in a pipe.
     assert "iteration" not in result.err
@@ -117,7 +118,7 @@ def test_a_solution_that_did_not_converge_is_written_and_exits_1(
     out = tmp_path / "out"
     result = run("solve", write_trial(tmp_path), "--out", out)
     assert result.code == 1
-    assert result.out.startswith("Verdict: do not use: the solver did not converge in 5 iter")
+    assert "\nVerdict: do not use: the solver did not converge in 5 iter" in result.out
     assert "error: not to be used: the solver did not converge in 5 iterations" in result.err
     assert not (out / "instrument.yaml").exists()
     assert json.loads((out / "calibration.json").read_text())["converged"] is False
@@ -256,7 +257,7 @@ def test_the_table_comes_before_its_warnings_in_one_file(tmp_path: Path) -> None
         stderr=subprocess.STDOUT,
         text=True,
         timeout=60,
-        check=True,
+        check=False,
     )
     assert 0 < done.stdout.index("missing %") < done.stdout.index("warning: `dvl` and `dvl_beams`")
 
@@ -292,7 +293,7 @@ def test_bad_usage_exits_2(
 def test_inspect_shows_records_and_findings(tmp_path: Path, run: Run) -> None:
     trial = build_trial(body_axes="FRD")
     result = run("inspect", write_trial(tmp_path, trial))
-    assert result.code == 0
+    assert result.code == 1
     for text in (
         "IMU",
         "GNSS",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -119,9 +120,10 @@ def test_help_and_version_are_texts(run: Run) -> None:
 
 def test_the_terms_of_instruments_are_a_result(tmp_path: Path, run: Run) -> None:
     file = tmp_path / "calibration.json"
-    file.write_bytes(encode_calibration(calibration()))
+    file.write_bytes(encode_calibration(replace(calibration(), limits={})))
     found, end = lines(run("instrument", file, "--json").out)
     assert found["event"] == "result"
+    assert found["content"]["enter_in_dvl"]["lever_arm_down_m"] == -3.0
     assert set(found["content"]["trdi"]) == {"EA", "EI", "EJ"}
     assert end["exit_code"] == 0
 

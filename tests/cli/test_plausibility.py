@@ -91,8 +91,13 @@ def run(capsys):
 
 def errors_of(run, trial_path):
     code, out, _ = run("inspect", trial_path)
-    assert code == 0
-    return [line.removeprefix("error: ") for line in out.splitlines() if line.startswith("error")]
+    *lines, count = out.splitlines()
+    found = [line.removeprefix("error: ") for line in lines if line.startswith("error")]
+    assert code == 1
+    # Errors come last, with their number.
+    assert lines[-len(found) :] == [f"error: {text}" for text in found]
+    assert count.startswith(f"Errors: {len(found)}.")
+    return found
 
 
 @pytest.fixture(

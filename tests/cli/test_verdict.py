@@ -10,6 +10,7 @@ import pytest
 from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 
+from factorgraph_dvl.cli.verdict import print_conclusion
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.solution_folder import save_solution
@@ -52,14 +53,13 @@ def commands(root: Path, out: Path) -> dict[str, list[object]]:
     written = ["--out", out, "--no-figures"]
     reckon = ["deadreckon", root / "trial", "--quiet", *written, "--calibration"]
     return {
-        "instrument": ["instrument", root / "bad"],
         "crosscheck": ["crosscheck", root / "bad", root / "bad", *written],
         "deadreckon": [*reckon, root / "bad", "--attitude", "reference"],
         "attitude": [*reckon, root / "values.json", "--attitude", root / "bad"],
     }
 
 
-@pytest.mark.parametrize("name", ["instrument", "crosscheck", "deadreckon", "attitude"])
+@pytest.mark.parametrize("name", ["crosscheck", "deadreckon", "attitude"])
 def test_a_result_that_is_not_to_be_used_is_refused(
     name: str, folder: Path, tmp_path: Path, run: Run
 ) -> None:
@@ -71,6 +71,32 @@ def test_a_result_that_is_not_to_be_used_is_refused(
     assert "--anyway" in refused.err
     assert not (tmp_path / "out").exists()
     assert REFUSAL not in run(*command, "--anyway").err
+
+
+def test_the_conclusion_leaves_room_on_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
+    reasons = [Finding(Code.DOES_NOT_FIT, f"reason {i}", severity="warning") for i in range(9)]
+    found = replace(condemned(), findings=tuple(reasons))
+    print_conclusion(found, "Exail", Path("out/report.html"))
+    lines = capsys.readouterr().out.splitlines()
+    # The longest table; before it come at most what was rejected, an accuracy, and the files.
+    assert len(lines) <= 30 - 3
+    assert lines[0].startswith("Verdict: doubtful: reason 0")
+    assert any("Delph X3" in line for line in lines)
+    assert any(line.startswith("Further reasons on the page: ") for line in lines)
+    assert lines[-1] == "Open out/report.html"
+
+
+def test_instrument_says_why_nothing_is_to_be_entered(folder: Path, run: Run) -> None:
+    refused = run("instrument", folder / "bad")
+    assert refused.code == 1
+    first, reason, *_ = refused.out.splitlines()
+    assert first == "# Verdict: do not use"
+    assert reason.startswith(f"#   error: {REASON}.")
+    assert all(line.startswith("#") for line in refused.out.splitlines())
+    shown = run("instrument", folder / "bad", "--anyway")
+    assert shown.code == 0
+    assert shown.out.startswith(refused.out)
+    assert "lever_arm_down_m: -1.000  # ± 0.010; positive: below; green" in shown.out
 
 
 def test_a_prior_that_is_not_to_be_used_is_refused(folder: Path, tmp_path: Path) -> None:

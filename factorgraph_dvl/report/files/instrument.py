@@ -2,14 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from factorgraph_dvl.analysis.instrument_terms import ORDERS, Angles, InstrumentTerms, Order
+from factorgraph_dvl.analysis.instrument_terms import (
+    ORDERS,
+    Angles,
+    InstrumentTerms,
+    Order,
+    instrument_of,
+)
 from factorgraph_dvl.analysis.mount import mount_in_words
+from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.quality.notation import at_precision, fixed
+from factorgraph_dvl.quality.verdict import Grade, Verdict
+from factorgraph_dvl.report.entries import (
+    REFUSED,
+    TITLE,
+    conventions,
+    entries_of,
+    hundredths,
+    looks_up,
+    looks_up_for_trdi,
+    worst,
+)
+from factorgraph_dvl.solution import Calibration, Solution
 
 _ORDER_TEXT: dict[Order, str] = {
     "ZYX": "intrinsic ZYX: C = Rz(yaw) Ry(pitch) Rx(roll)",
@@ -17,45 +36,99 @@ _ORDER_TEXT: dict[Order, str] = {
 }
 
 
-def instrument_text(instrument: InstrumentTerms, name: str) -> str:
+def verdict_text(verdict: Verdict) -> str:
+    """Return the verdict and all its reasons as comments of YAML, a line each."""
+    reasons = (f"#   {r.severity}: {printable(str(r))}. {r.code.action}" for r in verdict.reasons)
+    return "\n".join([f"# Verdict: {verdict.grade}", *reasons]) + "\n"
+
+
+def instrument_text(calibration: Calibration | Solution) -> str:
     """Return the text of `instrument.yaml`.
 
     Parameters
     ----------
-    instrument : InstrumentTerms
-        Terms to write.
-    name : str
-        Name of the calibrated trial.
+    calibration : Calibration or Solution
+        Calibration of a DVL. Its red and grey values are comments, with the reason.
+
+    Raises
+    ------
+    DataError
+        If it has no misalignment, scale error or lever arm.
     """
-    i = instrument
+    i = instrument_of(calibration)
     lines = [
-        f"# Calibration from trial {name}, in the terms of instruments.",
+        f"# Calibration from trial {printable(calibration.trial)}.",
         "#",
         "# Angles: roll about the forward axis (positive starboard down), pitch about the",
         "# starboard axis (positive bow up), yaw about the downward axis (positive clockwise from",
         "# above). The DVL's axes are named as the body's are: if aligned, it has zero angles.",
         "",
+        f"# {TITLE}. {conventions(i)[0]}",
+        "# The DVL reads (1 + scale error) times the velocity.",
+        f"# {conventions(i)[2]}",
+        "enter_in_dvl:",
+        *(
+            _line(
+                f"  {e.key}: {e.text}",
+                e.grade,
+                f"± {at_precision(e.std, e.std)}; positive: {e.rule}",
+            )
+            for e in entries_of(i)
+        ),
+        "",
         "# The mount, with the axes of the DVL as they were recorded:",
         *(f"# {sentence}" for sentence in mount_in_words(i.axes)),
+        *_further(i),
+    ]
+    return verdict_text(calibration.verdict) + "\n".join(lines) + "\n"
+
+
+def _line(text: str, grade: Grade, about: str = "") -> str:
+    """Return a line of YAML with its grade; a comment where the value must not be entered."""
+    if reason := REFUSED.get(grade):
+        name, _, value = text.partition(":")
+        indent = name[: len(name) - len(name.lstrip())]
+        return f"{indent}# {name.strip()}:{value}  # {grade}: {reason}"
+    return f"{text}  # {about + '; ' if about else ''}{grade}"
+
+
+def _further(i: InstrumentTerms) -> Iterator[str]:
+    """Yield the calibration in further conventions, and in those of makers."""
+    angles, arm, scale = (worst(g) for g in _grades(i))
+    yield from (
         "",
         "# Attitude of the DVL in the vehicle, C_d^b: DVL components to body components.",
-        "dvl_in_body:",
-        *_angles(i.dvl_in_body),
-        "",
-        "# C_b^d: body components to DVL components.",
-        "body_to_dvl:",
-        *_angles(i.body_to_dvl),
+    )
+    yield "dvl_in_body:"
+    yield from _angles(i.dvl_in_body)
+    yield from ("", "# C_b^d: body components to DVL components.", "body_to_dvl:")
+    yield from _angles(i.body_to_dvl)
+    yield from (
         "",
         "# The DVL reads (1 + error) times the velocity; multiply its velocity by the factor.",
+    )
+    for text in (
         f"scale_error_percent: {_list(100.0 * i.scale_error, 4)}",
         f"scale_error_std_percent: {_list(100.0 * i.scale_std, 4)}",
         f"scale_error_ppm: {_list(1e6 * i.scale_error, 0)}",
         f"scale_error_std_ppm: {_list(1e6 * i.scale_std, 0)}",
         f"scale_factor: {_list(1.0 / (1.0 + i.scale_error), 6)}",
-        "",
-        "# From the IMU to the DVL: forward, starboard, down.",
-        f"lever_arm_m: {_list(i.lever_arm, 4)}",
-        f"lever_arm_std_m: {_list(i.lever_arm_std, 4)}",
+    ):
+        yield _line(text, scale)
+    yield from ("", f"# From the {i.origin} to the DVL: forward, starboard, down.")
+    yield _line(f"lever_arm_m: {_list(i.lever_arm, 4)}", arm)
+    yield _line(f"lever_arm_std_m: {_list(i.lever_arm_std, 4)}", arm)
+    yield from _trdi(i, angles)
+    yield from _makers(i, angles, scale, arm)
+
+
+def _grades(i: InstrumentTerms) -> tuple[tuple[Grade, ...], ...]:
+    """Return the grades of angles, lever arm and scale error."""
+    return i.dvl_in_body["ZYX"].grade, i.lever_arm_grade, i.scale_grade
+
+
+def _trdi(i: InstrumentTerms, grade: Grade) -> Iterator[str]:
+    yield from (
         "",
         "# TRDI, 0.01 deg. EA is the direction of beam 3 seen from the ship's bow, positive",
         "# clockwise from above. EI and EJ are roll and pitch of the ship when the instrument is",
@@ -64,86 +137,72 @@ def instrument_text(instrument: InstrumentTerms, name: str) -> str:
         "# instrument coordinates (aligned: X to starboard, Y, beam 3, ahead, Z up) with EA, EI",
         "# and EJ at 0, and if the body axes are parallel to those of the ship. EI and EJ are as",
         "# in the Pathfinder DVL Guide (2018). The sign of EA is NOT VERIFIED against a manual.",
-        *(_NOT_TRDI if np.max(np.abs(i.alignment[1:])) > _UPSIDE_DOWN_DEG else ()),
-        "trdi:",
-        *[
-            f"  {name}: {_hundredths(value)}                 # {_command(name, value)}, "
-            f"± {fixed(std, 4)} deg"
-            for name, value, std in zip(
-                ("EA", "EI", "EJ"), i.alignment.tolist(), i.alignment_std.tolist(), strict=True
-            )
-        ],
-    ]
-    return "\n".join([*lines, *_makers(i)]) + "\n"
+    )
+    if looks_up_for_trdi(i):
+        yield from _NOT_TRDI
+    yield "trdi:"
+    for name, value, std in zip(
+        ("EA", "EI", "EJ"), i.alignment.tolist(), i.alignment_std.tolist(), strict=True
+    ):
+        about = f"{_command(name, value)}, ± {fixed(std, 4)} deg"
+        yield _line(f"  {name}: {hundredths(value)}", grade, about)
 
 
-def _makers(i: InstrumentTerms) -> list[str]:
-    """Return the calibration in the conventions of other makers, with their sign rules."""
+def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iterator[str]:
+    """Yield the calibration in the conventions of other makers, with their sign rules."""
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     mean = float(np.mean(i.scale_error))
     forward, starboard, down = (float(x) for x in i.lever_arm)
-    upside_down = max(abs(roll), abs(pitch)) > _UPSIDE_DOWN_DEG
     tilt = float(np.hypot(roll, pitch))
-    return [
+    yield from (
         "",
         "# Nortek: attitude of the DVL in the vehicle, axes forward, starboard, down; yaw first,",
         "# then pitch, then roll; each positive by the right hand about its axis.",
         f"# {_NOT_VERIFIED}",
         "nortek:",
-        f"  roll_pitch_yaw_deg: {_list([roll, pitch, yaw], 2)}",
+        _line(f"  roll_pitch_yaw_deg: {_list([roll, pitch, yaw], 2)}", angles),
         "",
         "# Water Linked: one angle, from the vehicle's forward axis to that of the DVL, positive",
         "# clockwise from above, in whole degrees from 0 to 359. Sign rule: DVL documentation,",
         f"# page Axes. The angle is {fixed(yaw, 2)} deg; the rest and the tilt of "
         f"{fixed(tilt, 2)} deg are left out.",
-        *(("# DO NOT TYPE IN: the DVL's axes look up.",) if upside_down else ()),
+        *(("# DO NOT TYPE IN: the DVL's axes look up.",) if looks_up(i) else ()),
         "water_linked:",
-        f"  mounting_rotation_offset: {round(yaw) % 360}",
+        _line(f"  mounting_rotation_offset: {round(yaw) % 360}", i.dvl_in_body["ZYX"].grade[2]),
         "",
         "# Delph-style: axes X1 forward, X2 to port, X3 up. Heading is positive clockwise from",
         "# above, roll positive port side up, pitch positive bow down. The scale factor is what",
-        "# the DVL reads too much, in %; the lever arm runs from the IMU to the DVL.",
+        f"# the DVL reads too much, in %; the lever arm runs from the {i.origin} to the DVL.",
         f"# {_NOT_VERIFIED}",
         "delph:",
-        f"  heading_pitch_roll_deg: {_list([yaw, -pitch, roll], 4)}",
-        f"  scale_factor_percent: {fixed(100.0 * mean, 4)}",
-        f"  lever_arm_x1_x2_x3_m: {_list([forward, -starboard, -down], 4)}",
-    ]
+        _line(f"  heading_pitch_roll_deg: {_list([yaw, -pitch, roll], 4)}", angles),
+        _line(f"  scale_factor_percent: {fixed(100.0 * mean, 4)}", scale),
+        _line(f"  lever_arm_x1_x2_x3_m: {_list([forward, -starboard, -down], 4)}", arm),
+    )
 
 
 _NOT_VERIFIED = (
     "The signs are NOT VERIFIED against the maker's manual: check one of them before use."
 )
-# Chosen: a DVL that looks down has a smaller roll and pitch.
-_UPSIDE_DOWN_DEG = 90.0
 _NOT_TRDI = (
     "# DO NOT TYPE IN: with these values, the instrument would look up. The DVL's data in this",
     "# trial are in other axes than TRDI's; convert them, and calibrate again.",
 )
 
 
-def _angles(by_order: dict[Order, Angles]) -> list[str]:
-    out = []
+def _angles(by_order: dict[Order, Angles]) -> Iterator[str]:
     for order in ORDERS:
         angles = by_order[order]
-        out += [
-            f"  {order}:                             # {_ORDER_TEXT[order]}",
-            f"    roll_pitch_yaw_deg: {_list(angles.value, 4)}",
-            f"    std_deg: {_list(angles.std, 4)}",
-        ]
-    return out
+        grade = worst(angles.grade)
+        yield f"  {order}:                             # {_ORDER_TEXT[order]}"
+        yield _line(f"    roll_pitch_yaw_deg: {_list(angles.value, 4)}", grade)
+        yield _line(f"    std_deg: {_list(angles.std, 4)}", grade)
 
 
 def _list(values: Array | Sequence[float], decimals: int) -> str:
     return "[" + ", ".join(fixed(float(v), decimals) for v in values) + "]"
 
 
-def _hundredths(angle: float) -> int:
-    """Return an angle, deg, in hundredths within -17999 to 18000."""
-    hundredths = round(100.0 * angle)
-    return hundredths + 36000 if hundredths <= -18000 else hundredths
-
-
 def _command(name: str, angle: float) -> str:
     prefix = "" if name == "EA" else "#"
-    return f"{prefix}{name}{_hundredths(angle):+06d}"
+    return f"{prefix}{name}{hundredths(angle):+06d}"

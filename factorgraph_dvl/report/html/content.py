@@ -53,9 +53,25 @@ class Result:
         return "trial" if self.redacted else self.solution.trial
 
     @property
+    def certificate(self) -> Mapping[str, Any]:
+        """What trial.yaml states for the certificate; empty if nothing, or if redacted."""
+        found: Mapping[str, Any] = {} if self.redacted else self.run.get("certificate", {})
+        return found
+
+    @property
+    def maker(self) -> str:
+        """Maker of the DVL, empty if not known."""
+        return maker_of(self.run.get("certificate", {}))
+
+    @property
     def start(self) -> float:
         """Time from which the page counts, s."""
         return float(self.solution.trajectory.time[0])
+
+
+def maker_of(certificate: Mapping[str, Any]) -> str:
+    """Return the maker of the DVL that a certificate names, empty if it does not."""
+    return str(certificate.get("dvl", {}).get("maker", ""))
 
 
 def redact(result: Result) -> Result:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from math import floor, log10
 
 from factorgraph_dvl.message import Message
 from factorgraph_dvl.quality.texts import chinese, component_names, text_of
@@ -44,6 +45,11 @@ def both(english: str, own: str = "") -> Html:
     return Html(
         f'<span lang="en">{escape(english)}</span><span lang="zh-Hans">{escape(other)}</span>'
     )
+
+
+def tspans(english: str, own: str = "") -> str:
+    """Return a phrase in both languages for a drawing, as `both` does for text."""
+    return both(english, own).text.replace("<span", "<tspan").replace("</span", "</tspan")
 
 
 def said(message: Message | str) -> Html:
@@ -118,7 +124,7 @@ def described(table_: Table, *, label: str) -> Html:
 def _described(cell: DescribedCell) -> Cell:
     if isinstance(cell, Component):
         return component_cell(cell.name)
-    return grade_cell(cell.text) if isinstance(cell, Mark) else cell
+    return grade_cell(cell.text) if isinstance(cell, Mark) else both(cell)
 
 
 def component_cell(component: str) -> Html:
@@ -170,3 +176,11 @@ def items(cells: Sequence[Cell]) -> Html:
 def folded(summary: str, *cells: Cell) -> Html:
     """Return cells that open on demand."""
     return element("details", element("summary", both(summary)), *cells)
+
+
+def round_step(size: float) -> float:
+    """Return the round number, 1, 2 or 5 times a power of ten, next above a size."""
+    if size <= 0.0:
+        return 1.0
+    power = 10.0 ** floor(log10(size))
+    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= size * 0.999))

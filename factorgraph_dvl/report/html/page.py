@@ -12,6 +12,7 @@ import numpy as np
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.quality.notation import fixed, with_std
 from factorgraph_dvl.quality.texts import component_names
+from factorgraph_dvl.report.html.certificate import certificate_section
 from factorgraph_dvl.report.html.content import Result, redact
 from factorgraph_dvl.report.html.markup import (
     Cell,
@@ -102,6 +103,7 @@ def report_page(result: Result, *, redacted: bool = False) -> str:
         halves_section(result),
         crosscheck_section(result),
         dead_reckoning_section(result),
+        certificate_section(result),
         settings_section(result),
     ]
     plots = [*motion, *deviations, *residuals]

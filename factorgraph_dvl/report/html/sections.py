@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
 from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments
 from factorgraph_dvl.analysis.information.marginals import marginals
+from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms
 from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
@@ -19,6 +21,7 @@ from factorgraph_dvl.quality.notation import fixed, in_words, with_std
 from factorgraph_dvl.quality.texts import chinese_cause, component_names
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.html.content import Result
+from factorgraph_dvl.report.html.entries import entries_content
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
@@ -28,7 +31,6 @@ from factorgraph_dvl.report.html.markup import (
     described,
     element,
     folded,
-    grade_cell,
     items,
     joined,
     paragraph,
@@ -67,24 +69,24 @@ _ERRORS = (
 )
 
 
+_FOR_EXPERTS = (
+    "For experts: this table has the numbers of calibration.json. The misalignment is the "
+    "rotation vector from body to DVL, and vectors are in the body axes of the trial. "
+    "Do not enter them."
+)
+
+
 def verdict_section(result: Result) -> Section:
     """Return what was found, how sure it is, what is wrong, and what to do."""
     solution = result.solution
     verdict = solution.verdict
     cells: list[Cell] = [verdict_box(verdict)]
-    main = [e for e in solution.estimates if e.name in solution.limits]
-    if main:
-        rows = [
-            [component_cell(name), with_std(float(value), float(std)), component_names(name)[2],
-             grade_cell(grade)]
-            for e in main
-            for name, value, std, grade in zip(
-                e.component_names, e.value, e.std, solution.grades[e.name], strict=True
-            )
-        ]  # fmt: skip
+    if has_instrument_terms(solution):
+        cells += entries_content(result)
+    elif main := [e for e in solution.estimates if e.name in solution.limits]:
+        shown = calibration_table(replace(solution, estimates=tuple(main))).brief()
         cells.append(element("h3", both("What was found")))
-        header = [both(x) for x in ("parameter", "value ± σ", "unit", "grade")]
-        cells.append(table(header, rows, label="What was found", numeric=(1,)))
+        cells.append(described(shown, label="What was found"))
     if verdict.reasons:
         cells.append(element("h3", both("Problems, and what to do")))
         cells += [_reason(f) for f in verdict.reasons]
@@ -148,6 +150,9 @@ def calibration_section(result: Result) -> Section:
             "Grades: green, σ is within its limit; orange, up to twice the limit; red, above "
             "that; grey, the data did not halve the σ known before the trial."
         )),
+        *(
+            [paragraph(both(_FOR_EXPERTS))] if has_instrument_terms(solution) else []
+        ),
         described(calibration_table(solution, known), label="Calibration"),
         *_noise(solution),
         key="calibration",

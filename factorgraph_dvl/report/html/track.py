@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import floor, log10
 
 import numpy as np
 
 from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.html.markup import Html, labels
+from factorgraph_dvl.report.html.markup import Html, labels, round_step, tspans
 
 # Size of the drawing and its margins, in its own units.
 _SIZE = 720.0
@@ -44,7 +43,7 @@ def track_svg(trajectory: Trajectory) -> Html:
         """Return places (M, 2), m, in the drawing, (M, 2)."""
         return 0.5 * _SIZE + (np.atleast_2d(p) - middle) * [scale, -scale]
 
-    step = _round_step(span / _LINES)
+    step = round_step(span / _LINES)
     unit, metres = ("km", 1000.0) if step >= 1000.0 else ("m", 1.0)
     parts = [
         f'<svg viewBox="0 0 {_SIZE:g} {_SIZE:g}" role="img" class="track" {_label()}>',
@@ -53,7 +52,7 @@ def track_svg(trajectory: Trajectory) -> Html:
         *_grid(middle, (_SIZE - 2.0 * _MARGIN) / scale, step, metres, pixel),
         f'<path class="way" d="{_path(pixel(places))}"/>',
     ]
-    interval = _round_step(float(time[-1] - time[0]) / _MARKS) if time.size > 1 else 0.0
+    interval = round_step(float(time[-1] - time[0]) / _MARKS) if time.size > 1 else 0.0
     if interval > 0.0:
         marks = np.arange(interval, float(time[-1] - time[0]), interval)
         for t in marks:
@@ -73,16 +72,12 @@ def track_svg(trajectory: Trajectory) -> Html:
         f'<rect class="end" x="{x1 - 6:.1f}" y="{y1 - 6:.1f}" width="12" height="12"/>',
         _compass(_SIZE - _MARGIN - 26.0, _MARGIN + 44.0),
         f'<text class="axis" x="{0.5 * _SIZE:g}" y="{_SIZE - 8:g}">'
-        f"{_both(f'east of start, {unit}', f'起点以东，{unit}')}</text>",
+        f"{tspans(f'east of start, {unit}', f'起点以东，{unit}')}</text>",
         f'<text class="axis" transform="translate(14 {0.5 * _SIZE:g}) rotate(-90)">'
-        f"{_both(f'north of start, {unit}', f'起点以北，{unit}')}</text>",
+        f"{tspans(f'north of start, {unit}', f'起点以北，{unit}')}</text>",
         "</svg>",
     ]
     return Html("".join(parts))
-
-
-def _both(english: str, own: str) -> str:
-    return f'<tspan lang="en">{english}</tspan><tspan lang="zh-Hans">{own}</tspan>'
 
 
 def _label() -> str:
@@ -131,11 +126,3 @@ def _path(points: Array) -> str:
     kept[1:] = np.any(np.diff(cells, axis=0) != 0.0, axis=1)
     text = " ".join(f"{x:g},{y:g}" for x, y in np.round(points[kept], 1))
     return f"M{text}"
-
-
-def _round_step(size: float) -> float:
-    """Return the round number, 1, 2 or 5 times a power of ten, next above a size."""
-    if size <= 0.0:
-        return 1.0
-    power = 10.0 ** floor(log10(size))
-    return float(next(m * power for m in (1.0, 2.0, 5.0, 10.0) if m * power >= size * 0.999))

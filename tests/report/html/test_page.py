@@ -156,7 +156,7 @@ def test_findings_and_causes_are_there_in_chinese() -> None:
         assert f'<span lang="en">{english}</span>' in page
         assert f'<span lang="zh-Hans">{chinese}</span>' in page
     assert f"{own[code]['meaning'][1]}（GNSS: gnss.csv of by hand is 0.2 s late）" in page
-    assert "IMU 噪声（0.1 deg/√h）" in page
+    assert "陀螺噪声（0.1 deg/√h）" in page
     assert chinese_cause("noise of DVL velocity") == "DVL 速度噪声"
     assert chinese_cause("prior of lever_arm_m") == "杆臂的先验"
     assert chinese_cause("DVL noise") == "DVL noise"

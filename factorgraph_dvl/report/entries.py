@@ -1,0 +1,178 @@
+"""What to enter in a DVL: mounting angles, scale error and lever arm, described once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
+from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
+from factorgraph_dvl.quality.verdict import Grade
+from factorgraph_dvl.report.table import Mark, Table
+from factorgraph_dvl.report.tables import GRADES
+
+TITLE = "Enter in your DVL"
+# Why a value must not be entered, by its grade.
+REFUSED = {
+    "red": "σ is more than twice its limit",
+    "grey": "the trial did not determine it",
+}
+# Chosen: a DVL that looks down has a smaller roll and pitch.
+_LOOKS_UP_DEG = 90.0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A number to enter.
+
+    Parameters
+    ----------
+    key : str
+        Name with unit, as in `instrument.yaml`.
+    name, unit : str
+        As people read them.
+    rule : str
+        What a positive number means.
+    value, std : float
+        In `unit`.
+    grade : Grade
+        Red and grey values must not be entered.
+    """
+
+    key: str
+    name: str
+    unit: str
+    rule: str
+    value: float
+    std: float
+    grade: Grade
+
+    @property
+    def text(self) -> str:
+        """The value to the second digit of its standard deviation."""
+        return at_precision(self.value, self.std)
+
+
+def entries_of(i: InstrumentTerms) -> tuple[Entry, ...]:
+    """Return roll, pitch, yaw, the scale errors and the lever arm, each with its sign rule."""
+    angles = i.dvl_in_body["ZYX"]
+    axes = ("",) if i.scale_error.size == 1 else ("_x", "_y", "_z")
+    words = (
+        ("roll_deg", "roll", "deg", "starboard down"),
+        ("pitch_deg", "pitch", "deg", "bow up"),
+        ("yaw_deg", "yaw", "deg", "to starboard"),
+        *(
+            (f"scale_error{axis}_percent", f"scale error{axis.replace('_', ' ')}", "%",
+             "reads too much")
+            for axis in axes
+        ),
+        ("lever_arm_forward_m", "lever arm forward", "m", "ahead"),
+        ("lever_arm_starboard_m", "lever arm starboard", "m", "to starboard"),
+        ("lever_arm_down_m", "lever arm down", "m", "below"),
+    )  # fmt: skip
+    value = np.concatenate([angles.value, 100.0 * i.scale_error, i.lever_arm])
+    std = np.concatenate([angles.std, 100.0 * i.scale_std, i.lever_arm_std])
+    graded = (*angles.grade, *i.scale_grade, *i.lever_arm_grade)
+    return tuple(
+        Entry(*own, float(v), float(s), grade)
+        for own, v, s, grade in zip(words, value, std, graded, strict=True)
+    )
+
+
+def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
+    """Return the table of what to enter, for the terminal and for the page.
+
+    Parameters
+    ----------
+    i : InstrumentTerms
+        Calibration in the terms of instruments.
+    maker : str, optional
+        Maker of the DVL; where it is known, the table has the maker's own names too.
+    """
+    table = Table(title=TITLE, caption=" ".join(conventions(i)))
+    table.column("quantity")
+    table.column("value ± σ", numeric=True)
+    table.column("unit")
+    table.column("positive")
+    table.column("grade")
+    for e in (entries := entries_of(i)):
+        table.row(
+            e.name, with_std(e.value, e.std), e.unit, e.rule, Mark(e.grade, GRADES[e.grade]),
+            end_section=e is entries[-1],
+        )  # fmt: skip
+    graded = {e.key: e.grade for e in entries}
+    for name, text, unit, of in maker_rows(i, maker):
+        grade = worst(graded[key] for key in graded if key.startswith(tuple(of)))
+        table.row(name, text, unit, "", Mark(grade, GRADES[grade]))
+    return table
+
+
+def conventions(i: InstrumentTerms) -> tuple[str, str, str]:
+    """Return how angles and lever arm are defined, and which values must not be entered."""
+    return (
+        "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
+        "Do not enter red or grey values.",
+        f"Lever arm: from the {i.origin} to the DVL.",
+    )
+
+
+def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequence[str]]]:
+    """Return what a maker calls the numbers: name, number, unit, and the entries they are from.
+
+    Parameters
+    ----------
+    i : InstrumentTerms
+        Calibration in the terms of instruments.
+    maker : str
+        As a certificate names it; there are no rows for a maker that is not known.
+    """
+    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
+    angles = ("roll", "pitch", "yaw")
+    known = maker.lower()
+    if any(name in known for name in ("trdi", "rdi", "teledyne")) and not looks_up_for_trdi(i):
+        return [
+            (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", angles)
+            for name, a in zip(("EA", "EI", "EJ"), i.alignment, strict=True)
+        ]
+    if "nortek" in known:
+        return [
+            (f"Nortek {name}", fixed(a, 2), "deg", angles)
+            for name, a in zip(angles, (roll, pitch, yaw), strict=True)
+        ]
+    if any(name in known for name in ("water linked", "waterlinked")) and not looks_up(i):
+        offset = f"{round(yaw) % 360}"
+        return [("Water Linked mounting_rotation_offset", offset, "deg", ("yaw",))]
+    if any(name in known for name in ("exail", "ixblue", "delph")):
+        forward, starboard, down = (float(x) for x in i.lever_arm)
+        arm = (("X1", forward), ("X2", -starboard), ("X3", -down))
+        return [
+            ("Delph heading", fixed(yaw, 2), "deg", angles),
+            ("Delph pitch", fixed(-pitch, 2), "deg", angles),
+            ("Delph roll", fixed(roll, 2), "deg", angles),
+            *((f"Delph {name}", fixed(x, 3), "m", ("lever_arm",)) for name, x in arm),
+        ]
+    return []
+
+
+def looks_up(i: InstrumentTerms) -> bool:
+    """Return whether the DVL looks up as it is mounted."""
+    return bool(np.max(np.abs(i.dvl_in_body["ZYX"].value[:2])) > _LOOKS_UP_DEG)
+
+
+def looks_up_for_trdi(i: InstrumentTerms) -> bool:
+    """Return whether TRDI's commands would make the DVL look up."""
+    return bool(np.max(np.abs(i.alignment[1:])) > _LOOKS_UP_DEG)
+
+
+def hundredths(angle: float) -> int:
+    """Return an angle, deg, in hundredths within -17999 to 18000."""
+    found = round(100.0 * angle)
+    return found + 36000 if found <= -18000 else found
+
+
+def worst(found: Iterable[Grade]) -> Grade:
+    """Return the worst of some grades."""
+    order: tuple[Grade, ...] = ("green", "orange", "grey", "red")
+    return max(found, key=order.index)

@@ -1,0 +1,23 @@
+"""What to enter in a DVL, on the page: the table, its conventions, the drawing of the vessel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from factorgraph_dvl.analysis.instrument_terms import instrument_of
+from factorgraph_dvl.report.entries import TITLE, conventions, entries_table
+from factorgraph_dvl.report.html.content import Result
+from factorgraph_dvl.report.html.markup import Html, both, described, element, joined, paragraph
+from factorgraph_dvl.report.html.vessel import vessel_drawing
+
+
+def entries_content(result: Result) -> Iterator[Html]:
+    """Yield what to enter in the DVL, or that there is nothing to enter."""
+    yield element("h3", both(TITLE))
+    if result.solution.verdict.grade == "do not use":
+        yield paragraph(both("Enter nothing: this result must not be used."))
+        return
+    terms = instrument_of(result.solution)
+    yield described(entries_table(terms, result.maker), label=TITLE)
+    yield paragraph(joined(*map(both, conventions(terms))))
+    yield vessel_drawing(terms, result.solution, result.run.get("settings", {}))

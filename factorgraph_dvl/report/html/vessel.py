@@ -1,0 +1,234 @@
+"""The vessel from above and from the side, to scale: IMU, antenna, and DVL turned as found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms
+from factorgraph_dvl.geometry.rotations import frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.html.markup import (
+    Html,
+    both,
+    element,
+    joined,
+    labels,
+    paragraph,
+    round_step,
+    tspans,
+)
+from factorgraph_dvl.sensors.gnss import LEVER_ARM as GNSS_LEVER_ARM
+from factorgraph_dvl.solution import Solution
+
+# Size of each drawing, and what is left free around the instruments, in its own units.
+_SIZE, _MARGIN = 360.0, 124.0
+# Length of the DVL's axes and beams, in units of the drawing. Chosen: their directions are seen.
+_AXIS, _BEAM = 54.0, 76.0
+# Beams of a Janus DVL, by direction from its axis and from ahead, deg.
+_SLANT, _AZIMUTHS = 30.0, (45.0, 135.0, 225.0, 315.0)
+# Points that are closer have one label, in units of the drawing.
+_APART = 16.0
+# Chosen: a vessel is drawn at least so wide, m, and an ellipse widens it at most so many times.
+_LEAST_M, _WIDEST = 0.5, 1.0
+# Standard deviations of an ellipse.
+_SIGMAS = 2.0
+# What is seen to the right and upward, of forward, starboard, down.
+_VIEWS = {
+    "From above": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "From the side, seen from starboard": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+
+
+@dataclass(frozen=True)
+class _Place:
+    """An instrument: its name, its place forward, starboard, down, m, and its covariance."""
+
+    name: str
+    place: Array
+    covariance: Array
+
+
+def vessel_drawing(
+    terms: InstrumentTerms, solution: Solution, settings: Mapping[str, Any]
+) -> Html:
+    """Return both views, side by side where there is room.
+
+    Parameters
+    ----------
+    terms : InstrumentTerms
+        Calibration of the DVL.
+    solution : Solution
+        With the antenna's lever arm, if it was estimated.
+    settings : mapping of str to object
+        Of the trial, by section: the antenna's lever arm, if it was not.
+    """
+    places = [
+        _Place(terms.origin, np.zeros(3), np.zeros((3, 3))),
+        *_antenna(terms, solution, settings),
+        _Place("DVL", terms.lever_arm, terms.lever_arm_covariance),
+    ]
+    # Columns are the axes of the DVL: forward, starboard, down.
+    axes = Rotation.from_euler("ZYX", terms.dvl_in_body["ZYX"].value[::-1], degrees=True)
+    figures = [
+        element("figure", _view(view, places, axes.as_matrix(), title),
+                element("figcaption", both(title)))
+        for title, view in _VIEWS.items()
+    ]  # fmt: skip
+    return joined(
+        element("div", *figures, class_="vessel"),
+        paragraph(
+            joined(
+                both(f"Reference point: {terms.origin}."),
+                both("Arrows: axes of the DVL. Dashed: four beams at 30° from its axis."),
+                both("Ellipses: 2 σ, to scale, so that small ones hide behind their points."),
+            )
+        ),
+    )
+
+
+def _antenna(
+    terms: InstrumentTerms, solution: Solution, settings: Mapping[str, Any]
+) -> Iterator[_Place]:
+    if terms.origin == ANTENNA or "gnss" not in settings:
+        return
+    frd = frd_from_body(solution.body_axes)
+    order = list(solution.order)
+    for e in solution.estimates:
+        if e.name == GNSS_LEVER_ARM:
+            rows = [order.index(name) for name in e.component_names]
+            covariance = frd @ solution.covariance[np.ix_(rows, rows)] @ frd.T
+            yield _Place(ANTENNA, frd @ e.value, covariance)
+            return
+    stated = np.array(settings["gnss"].get("lever_arm_m", np.zeros(3)), dtype=float)
+    yield _Place(ANTENNA, frd @ stated, np.zeros((3, 3)))
+
+
+def _view(view: Array, places: Sequence[_Place], axes: Array, title: str) -> Html:
+    """Return a drawing of one view (2, 3): what is seen to the right, and upward."""
+    points = np.stack([view @ p.place for p in places])
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = max(float((high - low).max()), _LEAST_M)
+    spread = [np.sqrt(np.maximum(np.diag(view @ p.covariance @ view.T), 0.0)) for p in places]
+    reach = np.minimum(_SIGMAS * np.stack(spread), _WIDEST * span)
+    low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
+    span = max(float((high - low).max()), span)
+    scale = (_SIZE - 2.0 * _MARGIN) / span
+    middle = 0.5 * (low + high)
+
+    def pixel(p: Array) -> Array:
+        return 0.5 * _SIZE + (p - middle) * [scale, -scale]
+
+    at = np.stack([pixel(p) for p in points])
+    given = " ".join(f'{k.replace("_", "-")}="{v}"' for k, v in labels(title).items())
+    parts = [
+        f'<svg viewBox="0 0 {_SIZE:g} {_SIZE:g}" role="img" {given}>',
+        f'<rect class="ground" width="{_SIZE:g}" height="{_SIZE:g}"/>',
+        _bow(view),
+        *(
+            _ellipse(xy, _SIGMAS * scale, view @ p.covariance @ view.T)
+            for xy, p in zip(at, places, strict=True)
+        ),
+        f'<path class="arm" d="M{_xy(at[0])} L{_xy(at[-1])}"/>',
+        *_dvl(at[-1], view, axes),
+        *_names(at, [p.name for p in places], -(view @ axes.sum(axis=1)) * [1.0, -1.0]),
+        *(f'<circle class="point" cx="{x:.1f}" cy="{y:.1f}" r="4"/>' for x, y in at),
+        _ruler(span, scale),
+        "</svg>",
+    ]
+    return Html("".join(parts))
+
+
+def _dvl(at: Array, view: Array, axes: Array) -> Iterator[str]:
+    """Yield axes and beams of the DVL, as they are seen."""
+    for azimuth in _AZIMUTHS:
+        level = np.sin(_SLANT * DEG)
+        beam = [
+            level * np.cos(azimuth * DEG), level * np.sin(azimuth * DEG), np.cos(_SLANT * DEG),
+        ]  # fmt: skip
+        end = at + _BEAM * (view @ axes @ beam) * [1.0, -1.0]
+        yield f'<path class="beam" d="M{_xy(at)} L{_xy(end)}"/>'
+    for k, name in enumerate(("forward", "starboard", "down")):
+        seen = (view @ axes[:, k]) * [1.0, -1.0]
+        length = float(np.hypot(*seen))
+        # An axis that points nearly at the reader hides behind its point.
+        if length < 0.25:
+            continue
+        end = at + _AXIS * seen
+        along, across = seen / length, np.array([-seen[1], seen[0]]) / length
+        head = " L".join(_xy(end - 7.0 * along + side * across) for side in (-4.0, 4.0))
+        yield f'<path class="axis{k}" d="M{_xy(at)} L{_xy(end)} M{_xy(end)} L{head} Z"/>'
+        x, y = end + [6.0, 12.0] * along
+        anchor = "middle" if abs(along[0]) < 0.5 else "start" if along[0] > 0.0 else "end"
+        yield (
+            f'<text class="axis{k}" text-anchor="{anchor}" x="{x:.1f}" y="{y + 4.0:.1f}">'
+            f"{tspans(name)}</text>"
+        )
+
+
+def _names(at: Array, names: Sequence[str], free: Array) -> Iterator[str]:
+    """Yield the names of the points, a line for each of those that are close together.
+
+    A name stands on the side of its point on which there are no others; that of the last, the
+    DVL, on the side that its axes leave free.
+    """
+    done: list[tuple[Array, int]] = []
+    for xy, name in zip(at, names, strict=True):
+        near = [n for other, n in done if np.hypot(*(xy - other)) < _APART]
+        line = max(near, default=-1) + 1
+        done.append((xy, line))
+        side = free if name == "DVL" else xy - at.mean(axis=0)
+        right = side[0] >= 0.0
+        x = xy[0] + (9.0 if right else -9.0)
+        y = xy[1] + (16.0 if side[1] >= 0.0 else -8.0) + 15.0 * line
+        anchor = "start" if right else "end"
+        yield (
+            f'<text class="place" text-anchor="{anchor}" x="{x:.1f}" y="{y:.1f}">'
+            f"{tspans(name)}</text>"
+        )
+
+
+def _ellipse(at: Array, scale: float, covariance: Array) -> str:
+    """Return an ellipse about a point, of a covariance (2, 2) seen to the right and upward."""
+    variance, turned = np.linalg.eigh(covariance)
+    if not np.isfinite(variance).all() or variance[1] <= 0.0:
+        return ""
+    a, b = scale * np.sqrt(np.maximum(variance[::-1], 0.0))
+    angle = -np.arctan2(turned[1, 1], turned[0, 1]) / DEG
+    return (
+        f'<ellipse class="sigma" rx="{a:.2f}" ry="{b:.2f}" '
+        f'transform="translate({_xy(at)}) rotate({angle:.1f})"/>'
+    )
+
+
+def _bow(view: Array) -> str:
+    """Return an arrow that points to the bow."""
+    x, y = view[:, 0] * [1.0, -1.0]
+    start = np.array([24.0, 56.0]) if y else np.array([_SIZE - 64.0, 24.0])
+    end = start + 32.0 * np.array([x, y])
+    side = np.array([-y, x])
+    back = end - 8.0 * np.array([x, y])
+    text = end + (np.array([8.0, 10.0]) if y else np.array([-16.0, 18.0]))
+    return (
+        f'<path class="bow" d="M{_xy(start)} L{_xy(end)} M{_xy(end)} L{_xy(back + 4.0 * side)} '
+        f'L{_xy(back - 4.0 * side)} Z"/>'
+        f'<text x="{text[0]:g}" y="{text[1]:g}">{tspans("bow")}</text>'
+    )
+
+
+def _ruler(span: float, scale: float) -> str:
+    length = round_step(0.4 * span)
+    y = _SIZE - 14.0
+    return (
+        f'<path class="bow" d="M14,{y - 4:g} V{y:g} H{14.0 + length * scale:.1f} V{y - 4:g}"/>'
+        f'<text x="{22.0 + length * scale:.1f}" y="{y:g}">{length:g} m</text>'
+    )
+
+
+def _xy(p: Array) -> str:
+    return f"{p[0]:.1f},{p[1]:.1f}"
