@@ -92,6 +92,10 @@ class ImuErrors:
         """Return the errors among parameters, (n,), SI."""
         return np.concatenate([parameters[name] for name in self.names])
 
+    def ends(self, parameters: Mapping[str, Array]) -> Array:
+        """Return by how much the predicted states at the ends of segments move, (S, 9)."""
+        return np.asarray(self._ends @ self.vector(parameters))
+
     def corrected(self, at: Attachment, bound: Attachment, errors: Array) -> Attachment:
         """Return an attachment without the errors; `bound` is where it was bound."""
         by = self._by[id(bound)]

@@ -1,84 +1,14 @@
-"""Measurements of one segment: attached to the state before it, and gated."""
+"""Measurements of one segment against their prediction."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.clocks import parameters_of, true_time
-from factorgraph_dvl.graph.sensor_factor import AttachedMeasurements, NodeMeasurements
-from factorgraph_dvl.graph.trajectory import Epochs, attached_epochs
-from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.replay.update import Innovations
 from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.protocol import Aid
-
-
-def attached(
-    aids: Sequence[Aid],
-    seg: Segments,
-    gravity_n: Array,
-    start: ReplayStart,
-    values: Mapping[str, Array],
-    epochs: Array,
-) -> tuple[NodeMeasurements | None, Epochs]:
-    """Return what was measured in a segment, and epochs of the trajectory in it.
-
-    Both at once: attaching few times takes as long as attaching one.
-
-    Parameters
-    ----------
-    aids : sequence of Aid
-        Records of the sensors.
-    seg : Segments
-        The segment.
-    gravity_n : ndarray, shape (1, 3)
-        `LocalFrame.gravity_without_rotation` along it, m/s².
-    start : ReplayStart
-        Frame and parameters.
-    values : mapping of str to ndarray
-        Values of all parameters, SI.
-    epochs : ndarray, shape (M,)
-        Times in the segment, s.
-
-    Returns
-    -------
-    measured : NodeMeasurements or None
-        The measurements; None if there are none.
-    attached_epochs : Epochs
-        The epochs.
-    """
-    observations = [o for aid in aids for o in aid.observations(start.frame, start.body_axes)]
-    rows: list[AttachedMeasurements] = []
-    times: list[Array] = []
-    count = 0
-    for o in observations:
-        time = true_time(o, values, start.clock_zero)
-        if rows and np.array_equal(time, rows[-1].time):
-            # Of one sensor, such as position and velocity of GNSS.
-            rows.append(AttachedMeasurements(o, rows[-1].at, time))
-            continue
-        rows.append(AttachedMeasurements(o, slice(count, count + time.size), time))
-        times.append(time)
-        count += time.size
-    found, at = attached_epochs(seg, epochs, start.frame.earth_rate, np.concatenate([*times, []]))
-    if not rows:
-        return None, found
-    used = {name for o in observations for name in parameters_of(o)}
-    measured = NodeMeasurements(
-        attachment=at,
-        rows=tuple(rows),
-        parameters=tuple(p for p in start.parameters if p.name in used),
-        fixed=start.fixed,
-        gravity_n=gravity_n,
-        earth_rate_n=start.frame.earth_rate,
-        clock_zero=start.clock_zero,
-    )
-    return measured, found
 
 
 def gated(
@@ -120,9 +50,9 @@ def gated(
     all_found, all_spread = np.where(there, (residual, total), np.nan)
     weights, innovations, findings = [], [], []
     first = 0
-    for r in measured.rows:
-        o = r.observation
-        shape = r.time.size, len(o.components)
+    for b in measured.bound:
+        o = b.observation
+        shape = b.weight.shape
         part = slice(first, first + shape[0] * shape[1])
         first = part.stop
         found, spread = all_found[part].reshape(shape), all_spread[part].reshape(shape)

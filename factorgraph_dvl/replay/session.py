@@ -38,11 +38,6 @@ KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
 # within 0.1 standard deviations of a batch solution.
 LAG = 30.0
 RATE = 5.0
-_IMU_ERRORS_LEFT_OUT = Finding(
-    Code.IMU_ERRORS_LEFT_OUT,
-    message("imu_errors_left_out.replay"),
-    sensor="IMU",
-)
 
 
 class Replay:
@@ -105,9 +100,6 @@ class Replay:
                 hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
             )
         self._findings: list[Finding] = []
-        if any(p.estimated for p in settings.inertial.error_parameters()):
-            settings = replace(settings, imu=settings.inertial.without_errors())
-            self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._settings = settings
         self._sections = tuple(aid.section for aid in settings.aids)
         self._kind = smoother
@@ -320,9 +312,7 @@ class Replay:
         self._deferred.clear()
         self._noise = start.noise
         lag = self._lag if self._kind == "fixed-lag" else None
-        self._navigator = Navigator(
-            start, self._settings.inertial, self._gate, lag=lag, memory=self._lag
-        )
+        self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
         self._smoothed_to = start.node
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.

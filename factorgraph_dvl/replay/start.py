@@ -43,8 +43,8 @@ class ReplayStart:
 
     Parameters
     ----------
-    frame : LocalFrame
-        Navigation frame of the states.
+    chain : InertialChain
+        What the segments to come follow.
     body_axes : BodyAxes
         Axes of the body.
     node : int
@@ -69,8 +69,6 @@ class ReplayStart:
         Widths in samples over which gyros and accelerometers are smoothed.
     spurious : ndarray, shape (P, P)
         Spurious information on the parameters, in units of the priors' standard deviations.
-    walking : bool
-        Whether biases walk.
     noise_factors : mapping of str to ndarray
         By label, factors (d,) on the standard deviations that sensors state for their own noise.
     noise : tuple of Noise
@@ -87,7 +85,7 @@ class ReplayStart:
         Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
-    frame: LocalFrame
+    chain: InertialChain
     body_axes: BodyAxes
     node: int
     time: float
@@ -101,7 +99,6 @@ class ReplayStart:
     own_states: tuple[str, ...]
     windows: tuple[int, int]
     spurious: Array
-    walking: bool
     noise_factors: Mapping[str, Array]
     noise: tuple[Noise, ...]
     errors: CorrelatedErrors
@@ -109,6 +106,16 @@ class ReplayStart:
     trajectory: Trajectory
     findings: tuple[Finding, ...]
     misfit: float
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Navigation frame of the states."""
+        return self.chain.frame
+
+    @property
+    def walking(self) -> bool:
+        """Whether biases walk."""
+        return self.chain.walking
 
     def columns(self, names: Collection[str]) -> np.ndarray:
         """Return the indices of some parameters' components among those of all estimated."""
@@ -194,7 +201,7 @@ def solve_start(
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
-        frame=chain.frame,
+        chain=chain,
         body_axes=trial.body_axes,
         node=last,
         time=time,
@@ -208,7 +215,6 @@ def solve_start(
         own_states=_own_states(trial, chain.frame, interval),
         windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
-        walking=chain.walking,
         noise_factors=problem.white_factors,
         noise=noise_of(problem),
         errors=errors,

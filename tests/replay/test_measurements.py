@@ -8,40 +8,39 @@ from types import SimpleNamespace
 import numpy as np
 
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.measurements import attached, gated
+from factorgraph_dvl.replay.measurements import gated
 
 
-def attached_to(started, aids, seg):
+def bound_to(started, aids, seg):
     start = started.start
     p_n = start.values.atNavState(keys.node(start.node)).position()
     values = {p.name: np.eye(3) if p.rotation else p.mean for p in start.all_parameters}
     gravity = start.frame.gravity_without_rotation(p_n[None])
-    return attached(aids, seg, gravity, start, values, np.empty(0))[0]
+    chain = start.chain.following(seg, gravity, start.node)
+    observations = [o for aid in aids for o in aid.observations(start.frame, start.body_axes)]
+    bound, _ = bind(chain, observations, start.parameters, {}, values, start.clock_zero)
+    return NodeMeasurements.of(bound, start.parameters, start.fixed)
 
 
 def test_measurements_of_one_time_share_the_motion_there(started):
     seg = started.segment(0)
     gnss, dvl = started.aids(seg)
-    found = attached_to(started, [gnss, replace(dvl, time=dvl.time + 0.05)], seg)
-    by_label = {r.observation.label: r for r in found.rows}
-    assert by_label["GNSS position"].at == by_label["GNSS velocity"].at
-    assert by_label["DVL velocity"].at != by_label["GNSS velocity"].at
+    found = bound_to(started, [gnss, replace(dvl, time=dvl.time + 0.05)], seg)
+    by_label = {b.observation.label: b for b in found.bound}
+    assert by_label["GNSS position"].attachment is by_label["GNSS velocity"].attachment
+    assert by_label["DVL velocity"].attachment is not by_label["GNSS velocity"].attachment
     names = {p.name for p in found.parameters}
     assert {"misalignment_deg", "scale_error", "lever_arm_m"} <= names
     assert names <= {p.name for p in started.start.parameters}
-
-
-def test_a_segment_without_measurements_has_no_factor(started):
-    seg = started.segment(0)
-    assert attached_to(started, [], seg) is None
 
 
 def measured(label, time, components, gate=None):
     o = SimpleNamespace(
         label=label, unit="m/s", components=components, time=np.asarray(time, float), gate=gate
     )
-    return SimpleNamespace(observation=o, time=o.time)
+    return SimpleNamespace(observation=o, weight=np.ones((o.time.size, len(components))))
 
 
 def test_innovations_have_the_spread_of_prediction_and_noise_and_outliers_no_weight():
@@ -51,7 +50,7 @@ def test_innovations_have_the_spread_of_prediction_and_noise_and_outliers_no_wei
     sigma = np.array([4.0, 3.0, 4.0, np.inf, 1.0])
     residual = np.array([5.0, 10.0, 500.0, 7.0, 0.1])
     weights, innovations, findings = gated(
-        SimpleNamespace(rows=rows), residual, jacobian, sigma, P, InnovationGate()
+        SimpleNamespace(bound=rows), residual, jacobian, sigma, P, InnovationGate()
     )
     np.testing.assert_allclose(innovations[0].sigma, [[5.0, 5.0], [5.0, np.nan]])
     np.testing.assert_allclose(innovations[0].residual, [[5.0, 10.0], [500.0, np.nan]])

@@ -12,7 +12,7 @@ from factorgraph_dvl.replay.navigator import Navigator
 
 @pytest.fixture
 def navigator(started):
-    return Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
+    return Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0)
 
 
 def position_sigma(navigator, started):
@@ -36,8 +36,7 @@ def test_a_segment_takes_the_motion_on_by_its_length(navigator, started):
 
 def test_without_measurements_the_position_becomes_worse_and_with_them_not(started):
     alone, aided = (
-        Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
-        for _ in range(2)
+        Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0) for _ in range(2)
     )
     before = position_sigma(alone, started)
     for i in range(4):
@@ -50,8 +49,7 @@ def test_without_measurements_the_position_becomes_worse_and_with_them_not(start
 
 def test_late_measurements_correct_what_is_known(started):
     on_time, late = (
-        Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
-        for _ in range(2)
+        Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0) for _ in range(2)
     )
     kept = {}
     for i in range(3):
