@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import factorgraph_dvl as fd
-from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.grades import Grade, grades
 from factorgraph_dvl.sensors.imu import Imu

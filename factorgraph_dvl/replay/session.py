@@ -15,15 +15,19 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.replay.clocks import Clocks
-from factorgraph_dvl.replay.duplicates import Duplicates
+from factorgraph_dvl.replay.arrivals import (
+    AHEAD,
+    SAME_TIME,
+    Clocks,
+    Duplicates,
+    Outages,
+    PendingMeasurements,
+)
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.initializer import Initializer
 from factorgraph_dvl.replay.navigator import Navigator
-from factorgraph_dvl.replay.outages import Outages
-from factorgraph_dvl.replay.pending import AHEAD, SAME_TIME, PendingMeasurements
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
-from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid
@@ -258,7 +262,8 @@ class Replay:
                 self._restart(nav, seg)
                 continue
             until = float(seg.node_time[1])
-            if end and until > self._samples.newest - 0.5 * self._samples.dt:
+            last = end and until > self._samples.newest - 0.5 * self._samples.dt
+            if last:
                 # No segment follows that what was measured right now would belong to.
                 until += 2.0 * SAME_TIME
             nav.extend(seg, self._take(nav, until))
@@ -268,7 +273,9 @@ class Replay:
             self._samples.forget(nav.time)
             trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
             self._trajectory_to = nav.time
-            again = self._solve_again(nav) if self._initializer.solve_due(nav) else None
+            # What has not settled by the end is solved once more.
+            due = self._initializer.solve_due(nav) or (last and not self.settled)
+            again = self._solve_again(nav) if due else None
             known, solved = (nav, False) if again is None else (again, True)
             yield self._update(known, began, trajectory, solved=solved, end=end)
 

@@ -75,6 +75,8 @@ class ReplayStart:
         Noise as it is reported.
     errors : CorrelatedErrors
         Correlated errors of the sensors.
+    noise_known : bool
+        Whether the records are long enough to show what persists of the noise.
     clock_zero : float
         When the offsets of clocks hold, s.
     trajectory : Trajectory
@@ -102,6 +104,7 @@ class ReplayStart:
     noise_factors: Mapping[str, Array]
     noise: tuple[Noise, ...]
     errors: CorrelatedErrors
+    noise_known: bool
     clock_zero: float
     trajectory: Trajectory
     findings: tuple[Finding, ...]
@@ -218,6 +221,9 @@ def solve_start(
         noise_factors=problem.white_factors,
         noise=noise_of(problem),
         errors=errors,
+        noise_known=not any(
+            p.density_only and p.label in problem.noise_factors for p in problem.processes
+        ),
         clock_zero=clock_zero,
         trajectory=chain.trajectory(
             evaluation.states, covariances.nodes, trial.body_axes, TRAJECTORY_RATE, since

@@ -607,12 +607,6 @@ class Code(StrEnum):
         "Standard deviations do not contain the effect of this error.",
         "Use --halves, which reports changes that are larger than chance.",
     )
-    IMU_ERRORS_LEFT_OUT = (
-        "imu_errors_left_out",
-        "The replay does not estimate scale, axes and g-sensitivity of the IMU.",
-        "Its standard deviations do not contain the effect of these errors.",
-        "Use `solve` for standard deviations that contain them.",
-    )
     SILENT = (
         "silent",
         "A sensor no longer sends measurements.",

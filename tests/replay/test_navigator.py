@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
+from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.navigator import LocalGravity, Navigator
+
+
+def test_gravity_is_that_of_the_full_model_along_a_track():
+    frame = LocalFrame(0.6, 0.3, 10.0)
+    gravity = LocalGravity(frame)
+    for step in np.linspace(0.0, 3000.0, 200):
+        p = np.array([[step, 0.5 * step, -0.01 * step]])
+        exact = frame.gravity_without_rotation(p)
+        np.testing.assert_allclose(gravity.at(p), exact, rtol=0.0, atol=3e-9)
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.replay.record import Recorder
-from factorgraph_dvl.replay.update import Innovations, Update
+from factorgraph_dvl.replay.record import Innovations, Recorder, Update
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.solution import Estimate, Trajectory
 

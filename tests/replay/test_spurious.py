@@ -7,7 +7,7 @@ import pytest
 
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind, state_of
-from factorgraph_dvl.replay.gravity import LocalGravity
+from factorgraph_dvl.replay.navigator import LocalGravity
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 

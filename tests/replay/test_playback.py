@@ -9,8 +9,8 @@ import pytest
 from truth import scenario
 
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.replay.verdict_as_it_goes import VerdictAsItGoes
+from factorgraph_dvl.replay.playback import VerdictAsItGoes
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Estimate, Trajectory
