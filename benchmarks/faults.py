@@ -26,6 +26,7 @@ import numpy as np
 from fault_rows import MOTIONS, ROWS, SCENARIOS, Row
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.graph.problem import Problem
@@ -76,7 +77,7 @@ def outcome(run: Run) -> dict[str, Any]:
         made = run.trial()
     except FactorgraphDvlError as error:
         # No record may hold such values.
-        return {"grade": "refused", "exit": error.exit_code, "reason": str(error)}
+        return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
     with tempfile.TemporaryDirectory() as folder:
         save_trial(made, Path(folder) / "trial", parquet=True)
         start = time.process_time()
@@ -84,7 +85,7 @@ def outcome(run: Run) -> dict[str, Any]:
             trial = load_trial(Path(folder) / "trial")
             solution = solve(trial, rate_hz=1.0)
         except FactorgraphDvlError as error:
-            return {"grade": "refused", "exit": error.exit_code, "reason": str(error)}
+            return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
     return {
         "cpu_s": round(time.process_time() - start, 1),
         **errors(solution, made),

@@ -20,10 +20,11 @@ from factorgraph_dvl.analysis.error_statistics import (
     nees_band,
     trajectory_errors,
 )
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.earlier_calibration import calibrated_by, with_biases_of
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import parse_scenario, simulate
-from factorgraph_dvl.solution import Calibration, Estimate, Solution
+from factorgraph_dvl.solution import Calibration, Solution
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import InitialAttitude, InitialPosition, InitialVelocity, Trial
 

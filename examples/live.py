@@ -33,11 +33,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import factorgraph_dvl as fd
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.verdict import Grade, grades, verdict_of
 from factorgraph_dvl.replay.record import Update
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.grades import Grade, grades
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.verdict import verdict_of
 
 SHORT_RUN = Path(__file__).parent / "short.yaml"
 DAY = 86400.0

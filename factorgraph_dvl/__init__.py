@@ -17,7 +17,7 @@ Trials: `Trial`, `trial_from_tables`, `load_trial`, `save_trial`, `simulate`, an
 
 Estimates: `solve`, `Replay`, `kalman` (the usual filters, to compare). They return a `Solution`,
 with its `Trajectory`, each `Estimate` and a `Verdict`; `load_solution`, `save_solution`,
-`load_calibration`.
+`load_calibration`; `plot`, `to_dataframe`, `to_xarray`.
 
 Analyses: `crosscheck`, `observability`, `predict` (of a scenario from `load_scenario`),
 `dead_reckon` (with `mounting_of` and an `AttitudeHistory`), and of many trials
@@ -47,7 +47,9 @@ if TYPE_CHECKING:
         FactorgraphDvlError,
         SolveError,
     )
+    from factorgraph_dvl.estimates import Estimate, Trajectory
     from factorgraph_dvl.files.calibration_file import load_calibration
+    from factorgraph_dvl.files.data_frames import to_dataframe, to_xarray
     from factorgraph_dvl.files.solution_folder import load_solution, save_solution
     from factorgraph_dvl.files.trial_folder import load_trial, save_trial
     from factorgraph_dvl.files.trial_tables import trial_from_tables
@@ -58,15 +60,16 @@ if TYPE_CHECKING:
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
     from factorgraph_dvl.imu.preintegration import preintegrate
     from factorgraph_dvl.planning.prediction import predict
-    from factorgraph_dvl.quality.survey import survey
+    from factorgraph_dvl.plausibility.survey import survey
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.replay.session import Replay
+    from factorgraph_dvl.report.figures.solution import plot
     from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
     from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
     from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-    from factorgraph_dvl.sensors.verdict import Verdict
     from factorgraph_dvl.simulation import simulate
     from factorgraph_dvl.simulation.scenario import load_scenario
-    from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
+    from factorgraph_dvl.solution import Calibration, Solution
     from factorgraph_dvl.solvers.batch import solve, solved_problems
     from factorgraph_dvl.trial import Trial
 
@@ -80,7 +83,7 @@ _PUBLIC = {
     "DataError": "errors",
     "Dvl": "sensors.dvl",
     "DvlSettings": "sensors.dvl",
-    "Estimate": "solution",
+    "Estimate": "estimates",
     "FactorgraphDvlError": "errors",
     "Gnss": "sensors.gnss",
     "GnssSettings": "sensors.gnss",
@@ -91,10 +94,10 @@ _PUBLIC = {
     "Replay": "replay.session",
     "Solution": "solution",
     "SolveError": "errors",
-    "Trajectory": "solution",
+    "Trajectory": "estimates",
     "Trial": "trial",
     "TrialCalibration": "campaign.information",
-    "Verdict": "sensors.verdict",
+    "Verdict": "quality.verdict",
     "check_sensor": "graph.sensor_check",
     "crosscheck": "analysis.comparison.crosscheck",
     "dead_reckon": "analysis.dead_reckoning.integration",
@@ -108,6 +111,7 @@ _PUBLIC = {
     "measured_nodes": "graph.sensor_factor",
     "mounting_of": "analysis.dead_reckoning.integration",
     "observability": "analysis.information.observability",
+    "plot": "report.figures.solution",
     "predict": "planning.prediction",
     "preintegrate": "imu.preintegration",
     "save_solution": "files.solution_folder",
@@ -116,7 +120,9 @@ _PUBLIC = {
     "simulate": "simulation",
     "solve": "solvers.batch",
     "solved_problems": "solvers.batch",
-    "survey": "quality.survey",
+    "survey": "plausibility.survey",
+    "to_dataframe": "files.data_frames",
+    "to_xarray": "files.data_frames",
     "trial_from_tables": "files.trial_tables",
 }
 
@@ -155,6 +161,7 @@ __all__ = [
     "measured_nodes",
     "mounting_of",
     "observability",
+    "plot",
     "predict",
     "preintegrate",
     "save_solution",
@@ -164,6 +171,8 @@ __all__ = [
     "solve",
     "solved_problems",
     "survey",
+    "to_dataframe",
+    "to_xarray",
     "trial_from_tables",
 ]
 

@@ -33,8 +33,6 @@ class FactorgraphDvlError(Exception):
     no-such-trial: the trial does not exist; expected a trial folder
     """
 
-    exit_code = 1
-
     def __init__(self, what: str, *, where: str = "", expected: str = "", hint: str = "") -> None:
         # Names, keys and cells in it are those of files, whatever these hold.
         self.what, self.where = printable(what), printable(where)
@@ -58,8 +56,6 @@ class ConfigError(FactorgraphDvlError):
     factorgraph_dvl.errors.ConfigError: rate_hz is -1.0; expected a number above 0
     """
 
-    exit_code = 2
-
 
 class DataError(FactorgraphDvlError):
     """A data file or record does not hold what it should.
@@ -72,8 +68,6 @@ class DataError(FactorgraphDvlError):
     factorgraph_dvl.errors.DataError: ...
     """
 
-    exit_code = 2
-
 
 class SolveError(FactorgraphDvlError):
     """The input was valid, but no trustworthy solution was found.
@@ -81,17 +75,13 @@ class SolveError(FactorgraphDvlError):
     Examples
     --------
     >>> from factorgraph_dvl import SolveError
-    >>> SolveError("the cost at the start is not finite").exit_code
-    1
+    >>> print(SolveError("the cost at the start is not finite", hint="Check the units."))
+    the cost at the start is not finite. Check the units.
     """
-
-    exit_code = 1
 
 
 class OutputError(FactorgraphDvlError):
     """Results were found, and could not be written."""
-
-    exit_code = 1
 
 
 def as_text(name: object) -> str:

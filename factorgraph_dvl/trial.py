@@ -14,6 +14,8 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
@@ -21,10 +23,8 @@ from factorgraph_dvl.sensors.catalogue import PLANAR, add_plug_in
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.fingerprint import fingerprints, shared
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import JointPrior

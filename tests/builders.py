@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import (
     InitialAttitude,
     InitialPosition,

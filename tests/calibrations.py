@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.estimates import Estimate
+from factorgraph_dvl.solution import Calibration
 
 ALPHA_DEG = np.array([10.0, -25.0, 130.0])
 

@@ -10,7 +10,8 @@ from builders import build_solution
 
 from factorgraph_dvl.analysis.comparison.calibration_difference import Component
 from factorgraph_dvl.analysis.comparison.crosscheck import CrossCheck
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.estimates import Estimate, Trajectory
+from factorgraph_dvl.solution import Solution
 
 
 def estimate(name: str, value: Any, std: Any, observable: Any = True) -> Estimate:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.quality.finding import Code, Finding
 
 
 def of_code(findings: Iterable[Finding], code: Code) -> list[str]:

@@ -6,8 +6,8 @@ import inspect
 import re
 from pathlib import Path
 
-from factorgraph_dvl.sensors import finding
-from factorgraph_dvl.sensors.finding import UNUSABLE, Code
+from factorgraph_dvl.quality import finding
+from factorgraph_dvl.quality.finding import UNUSABLE, Code
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "findings.md"
 BEGIN, END = "<!-- findings: begin -->", "<!-- findings: end -->"
@@ -22,7 +22,7 @@ def drawn() -> str:
     """Return the tables as they should be: one for each group of codes."""
     lines = [BEGIN]
     source = inspect.getsource(finding.Code)
-    for group, name in re.findall(r"^    (?:# (.*)\.|([A-Z_]+) = \()$", source, re.MULTILINE):
+    for group, name in re.findall(r"^    (?:# (.*)\.|([A-Z_]+) = .*)$", source, re.MULTILINE):
         if group:
             lines += ["", f"## {group}", "", *HEAD]
         if name:

@@ -27,15 +27,14 @@ CAPABILITIES = (
     (
         "units, rotations, Earth, settings, trial, solution",
         "conventions celestial directions earth errors solution trial yaml_file __init__",
-        "geometry/* settings/* errors solution trial __init__",
+        "geometry/* settings/* errors message estimates solution trial __init__",
         "settings/ranges settings/files",
     ),
     (
         "sensors: settings, records, residuals",
         "sensors/* beam_geometry gains turning",
         "sensors/*",
-        "sensors/ins sensors/attitude sensors/finding sensors/verdict sensors/invalid_values "
-        "sensors/imu_grades sensors/fingerprint sensors/grades sensors/clock",
+        "sensors/ins sensors/attitude sensors/imu_grades sensors/fingerprint sensors/clock",
     ),
     (
         "IMU: increments, preintegration, motion at any time",
@@ -59,13 +58,13 @@ CAPABILITIES = (
         "statistics/correlation statistics/constancy solvers/change_along_trial "
         "solvers/correlated_noise solvers/known_parameters solvers/motion_* "
         "solvers/preparation_without_imu "
-        "statistics/error_budget statistics/robust_weights statistics/rows statistics/scores "
-        "statistics/variance_components solvers/causes solvers/minima solvers/outliers",
+        "statistics/robust_weights statistics/rows statistics/scores "
+        "statistics/variance_components solvers/error_budget solvers/minima solvers/outliers",
     ),
     (
         "position from ranges, planar trials",
         "anchoring planar/*",
-        "ranging/* quality/*planar*",
+        "ranging/* plausibility/*planar*",
         "",
     ),
     ("replay", "replay/*", "replay/*", ""),
@@ -74,7 +73,7 @@ CAPABILITIES = (
         "Kalman baselines",
         "kalman/*",
         "baselines/*",
-        "baselines/nine_state_ukf baselines/liu_2020 baselines/luo_2024",
+        "baselines/liu_2020 baselines/luo_2024",
     ),
     (
         "simulation",
@@ -86,15 +85,15 @@ CAPABILITIES = (
         "trial and solution folders",
         "io/*",
         "files/*",
-        "files/formats/* files/importing/* files/exporting/* files/data_frames files/output_file "
+        "files/formats/* files/importing/* files/exporting/* files/data_frames "
         "files/run_file files/residual_table files/earlier_calibration",
     ),
     (
         "plausibility of records",
         "analysis/*sanity analysis/records analysis/*survey analysis/finding",
-        "quality/*",
-        "quality/consistency quality/bow_and_course quality/*_axes quality/axis_permutations "
-        "quality/sensor_clocks quality/earlier_calibration quality/refusal",
+        "quality/* plausibility/*",
+        "quality/* plausibility/consistency plausibility/axes plausibility/clocks "
+        "plausibility/earlier_calibration",
     ),
     (
         "analyses",
@@ -115,7 +114,7 @@ CAPABILITIES = (
         "cli/*",
         "cli/*",
         "cli/allan cli/import_files cli/reproduce cli/campaign* cli/events cli/export cli/report "
-        "cli/streams cli/memory cli/verdict",
+        "cli/verdict",
     ),
     ("publications, measured", "", "reproduce/*", "reproduce/*"),
 )

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from builders import build_solution
 
+from factorgraph_dvl.estimates import Cause, Residuals, Trajectory
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.html.content import Result
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.solution import Cause, Residuals, Trajectory
 
 
 def trajectory(seconds: float) -> Trajectory:

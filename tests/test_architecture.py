@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ast
 import os
+import tomllib
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import package_map
+import pytest
 from importlinter.cli import lint_imports
 
 import factorgraph_dvl
@@ -19,7 +22,7 @@ ROOT = PACKAGE.parent
 SENSOR_DATA = (
     *("Imu", "ImuSettings", "Gnss", "Ins", "Dvl", "Star", "Aid", "Motion"),
     *("Heading", "SpeedLog", "Depth", "Beacons"),
-    *("Parameter", "SPEC", "Code", "Finding", "message", "Message"),
+    *("Parameter", "SPEC"),
 )
 # GTSAM, SciPy and Matplotlib take most of a second to load: only what needs none of them may
 # be imported where the command line starts.
@@ -66,13 +69,61 @@ def test_contracts_of_imports_are_kept(monkeypatch):
     assert lint_imports(config_filename="pyproject.toml", no_cache=True) == os.EX_OK
 
 
+def importers_and_imported():
+    """Yield modules with what each imports, wherever in it: also in functions, also for types.
+
+    The public names of the package are left out: they are loaded when they are used.
+    """
+    names = {".".join(part for part in parts if part != "__init__") for parts in MODULES}
+    for parts in MODULES:
+        module = ".".join(part for part in parts if part != "__init__")
+        for name in imported(read(parts)):
+            target = name if name in names else name.rpartition(".")[0]
+            if target in names and target != module:
+                yield module, target
+
+
+def test_imports_make_no_circle():
+    for of in (lambda module: module, layer_of):
+        graph = {}
+        for module, target in importers_and_imported():
+            if of(module) != of(target):
+                graph.setdefault(of(module), set()).add(of(target))
+        try:
+            TopologicalSorter(graph).prepare()
+        except CycleError as circle:
+            raise AssertionError(" -> ".join(circle.args[1])) from None
+
+
+def test_a_circle_within_functions_would_be_seen():
+    source = "def f():\n    from factorgraph_dvl.solution import Solution\n"
+    assert imported(ast.parse(source)) == ["solution.Solution"]
+    with pytest.raises(CycleError):
+        TopologicalSorter({"solution": {"files"}, "files": {"solution"}}).prepare()
+
+
+def test_no_import_goes_up():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = settings["tool"]["importlinter"]["contracts"]
+    assert not any("ignore_imports" in contract for contract in contracts)
+    (layers,) = (each["layers"] for each in contracts if each["type"] == "layers")
+    floor = {name: number for number, names in enumerate(layers) for name in names.split(" | ")}
+    wrong = [
+        f"{module} imports {target}"
+        for module, target in importers_and_imported()
+        if layer_of(module) != layer_of(target)
+        and floor[layer_of(module)] >= floor[layer_of(target)]
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
 def test_the_map_of_the_package_is_that_of_the_tree():
     assert package_map.written() == package_map.drawn(), "run python tests/package_map.py"
 
 
 def test_the_top_holds_no_module_without_a_home():
     loose = {parts[0] for parts in MODULES if len(parts) == 1}
-    assert loose == {"errors", "solution", "trial"}
+    assert loose == {"errors", "estimates", "message", "solution", "trial"}
 
 
 def test_no_solver_loads_what_takes_longer_than_a_short_trial():

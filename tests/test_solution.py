@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 import factorgraph_dvl as fd
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.solution import consistency_findings
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.results import consistency_findings
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ["track", "motion", "dvl_residuals", "calibration", "correlation"]
@@ -66,21 +66,21 @@ def test_html_is_escaped(solution):
 def test_data_frames(solution, loaded):
     pytest.importorskip("pandas")
     for each in (solution, loaded):
-        calibration = each.to_dataframe()
+        calibration = fd.to_dataframe(each)
         assert list(calibration.index) == list(each.order)
         assert calibration.loc["scale_error", "std"] == each.estimate("scale_error").std[0]
         assert set(calibration["grade"]) <= {"green", "orange", "red", "grey"}
-        motion = each.to_dataframe("trajectory")
+        motion = fd.to_dataframe(each, "trajectory")
         np.testing.assert_allclose(motion["heading_deg"], np.degrees(each.trajectory.rph[:, 2]))
-        residuals = each.to_dataframe("residuals")
+        residuals = fd.to_dataframe(each, "residuals")
         assert len(residuals) == sum(r.residual.size for r in each.residuals)
     with pytest.raises(ConfigError, match="table is 'poses'"):
-        solution.to_dataframe("poses")
+        fd.to_dataframe(solution, "poses")
 
 
 def test_xarray_dataset(solution):
     pytest.importorskip("xarray", reason="xarray is not installed")
-    data = solution.to_xarray()
+    data = fd.to_xarray(solution)
     name = "misalignment_z_deg"
     variance = data["covariance"].sel(component=name, other_component=name)
     assert float(variance) == pytest.approx(float(data["std"].sel(component=name)) ** 2)
@@ -91,7 +91,7 @@ def test_xarray_dataset(solution):
 def test_a_missing_library_names_its_extra(solution, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(ConfigError, match=r"pandas is not installed.*notebook"):
-        solution.to_dataframe()
+        fd.to_dataframe(solution)
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -100,7 +100,7 @@ def test_every_figure_is_drawn_in_the_place_of_axes(loaded, name):
     axes = figure.subplots(2, 2)
     kept = [axes[0, 0], axes[0, 1], axes[1, 0]]
     box = axes[1, 1].get_position()
-    part = loaded.plot(name, axes=axes[1, 1])
+    part = fd.plot(loaded, name, axes=axes[1, 1])
     assert part in figure.subfigs
     assert figure.axes[:3] == kept
     figure.draw_without_rendering()
@@ -116,7 +116,7 @@ def test_every_figure_is_drawn_in_the_place_of_axes(loaded, name):
 
 
 def test_a_new_figure_may_show_the_truth(solution, trial):
-    fresh = solution.plot(trial=trial)
+    fresh = fd.plot(solution, trial=trial)
     assert isinstance(fresh, Figure)
     assert "truth" in [text.get_text() for text in fresh.legends[0].get_texts()]
 
@@ -124,13 +124,13 @@ def test_a_new_figure_may_show_the_truth(solution, trial):
 def test_axes_without_a_grid_have_a_place(loaded):
     figure = Figure()
     axes = figure.add_axes((0.5, 0.5, 0.4, 0.4))
-    part = loaded.plot("correlation", axes=axes)
+    part = fd.plot(loaded, "correlation", axes=axes)
     np.testing.assert_allclose(part.bbox.x0 / figure.bbox.width, 0.5)
 
 
 def test_an_unknown_figure_is_refused(solution):
     with pytest.raises(ConfigError, match=r"no figure 'poses'.*one of track, motion"):
-        solution.plot("poses")
+        fd.plot(solution, "poses")
 
 
 @pytest.mark.parametrize(("value", "std", "stated", "refused"), [

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec import UnsetType
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import values_of
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -20,7 +21,7 @@ from factorgraph_dvl.sensors.beam_geometry import (
     velocities,
 )
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DIRECTION, SCALE_ERROR, DvlBeams
-from factorgraph_dvl.solution import Calibration, Solution, values_of
+from factorgraph_dvl.solution import Calibration, Solution
 
 # Chosen: a beam further from its nominal direction than this many standard deviations, and
 # than this many deg, belongs to another instrument; good beams stay within 3.

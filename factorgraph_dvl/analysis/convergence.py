@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Estimate
 from factorgraph_dvl.trial import Trial
 
 

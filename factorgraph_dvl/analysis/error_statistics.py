@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import (
     exp_so3,
@@ -21,7 +22,7 @@ from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Reference
 
 # Chosen: files hold times to a microsecond or better.

@@ -22,6 +22,7 @@ from factorgraph_dvl.baselines.summary import (
     summarise,
 )
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.estimates import Residuals, Trajectory
 from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
     exp_so3,
@@ -30,7 +31,7 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array, interpolate
-from factorgraph_dvl.solution import Progress, Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 

@@ -12,8 +12,7 @@ from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, navigate
-from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
-from factorgraph_dvl.baselines.nine_state_ukf import unscented
+from factorgraph_dvl.baselines.nine_state import nine_state, unscented, with_bias
 from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
@@ -37,10 +36,10 @@ from factorgraph_dvl.baselines.summary import (
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
-from factorgraph_dvl.imu.timestamps import JUMP, without_strays
+from factorgraph_dvl.imu.timestamps import JUMP, without_restarted_clock
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC, Dvl
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -153,7 +152,7 @@ def calibrate(
     report = progress or (lambda stage, iteration, cost: None)
     if method == "4sv-2ob" or method == "4sv-3ob":
         return filter_planar(trial, method, progress=report)
-    trial = (trial if trial.imu is None else without_strays(trial)).on_one_clock()
+    trial = (trial if trial.imu is None else without_restarted_clock(trial)).on_one_clock()
     if method == "star" or method == "liu-2020":
         report("SINS/stars", 0, None)
         solution, outcome = calibrate_gyros(trial, rate_hz=rate_hz, printed=method == "liu-2020")
@@ -161,6 +160,17 @@ def calibrate(
     if method == "beams":
         solution, outcome = calibrate_beams(trial, rate_hz=rate_hz, report=report)
         return solution, history_of(outcome)
+    return _calibrate_dvl(trial, _dvl_of(trial, method), method, rate_hz, report)
+
+
+def _dvl_of(trial: Trial, method: DvlMethod) -> Dvl:
+    """Return the DVL that a method calibrates.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there is none, or it measures through the water, for which the method does not allow.
+    """
     dvl = trial.log
     if dvl is None:
         raise DataError(
@@ -177,6 +187,13 @@ def calibrate(
             expected="bottom",
             hint="`solve` estimates the current; methods joyce and pollard-read allow for it",
         )
+    return dvl
+
+
+def _calibrate_dvl(
+    trial: Trial, dvl: Dvl, method: DvlMethod, rate_hz: float, report: Progress
+) -> tuple[Solution, History | None]:
+    """Calibrate a DVL against the smoothed motion; see `calibrate`."""
     prior = {p.stem: p for p in dvl.parameters()}
     offset = float(prior["time_offset"].mean[0])
     pings = dvl.time[dvl.locked] - offset

@@ -17,8 +17,8 @@ from factorgraph_dvl.geometry.earth import RATE, enu_from_ecef, normal_gravity
 from factorgraph_dvl.geometry.rotations import BodyAxes, best_rotation, exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.imu import ImuSettings
-from factorgraph_dvl.sensors.message import Message, message
 
 # Chosen: error of the integrated velocity, m/s, that the gyro bias may cause within a window.
 _WINDOW_ERROR = 0.2

@@ -9,11 +9,11 @@ import numpy as np
 from factorgraph_dvl.baselines.navigation import navigate
 from factorgraph_dvl.baselines.summary import trajectory_of
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.imu.timestamps import without_strays
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.imu.timestamps import without_restarted_clock
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
 
 # Chosen: gap of GNSS, s, from which on the height is aided. The vertical channel of an INS
@@ -48,7 +48,7 @@ def sins(
     DataError
         If there is no GNSS position, or none while the IMU runs.
     """
-    trial = without_strays(replace(trial, notes=()))
+    trial = without_restarted_clock(replace(trial, notes=()))
     gnss = trial.gnss
     fixes = np.zeros(0) if gnss is None else gnss.time[~np.isnan(gnss.geodetic[:, 0])]
     if gnss is None or fixes.size == 0:

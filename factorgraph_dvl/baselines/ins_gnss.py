@@ -32,6 +32,7 @@ from factorgraph_dvl.geometry.vectors import Array, skew
 
 # Chosen: below this, rad, rotations add up to better than 1e-12.
 _SMALL_TURN = 1e-6
+_EYE = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -146,9 +147,6 @@ def run_filter(
     by_gyro = skew(steps.dv * steps.duration[:, None] - steps.dp)
     has_position = ~np.isnan(fixes.geodetic[:, 0])
     has_velocity = ~np.isnan(fixes.velocity[:, 0])
-    lever_arm = np.broadcast_to(fixes.lever_arm, (k_events, 3))
-    durations = steps.duration.tolist()
-    eye = np.eye(3)
 
     lat, lon, height = start.geodetic.tolist()
     v, C, P = start.velocity.copy(), start.nRb.copy(), start.covariance.copy()
@@ -156,79 +154,16 @@ def run_filter(
     F = np.eye(15)
     for k in range(k_events):
         if k:
-            j, T = k - 1, durations[k - 1]
-            bias_jacobian = steps.bias_jacobian[j]
-            CV = C @ (steps.dv[j] - bias_jacobian @ ba + by_gyro[j] @ bg)
-            CP = C @ (steps.dp[j] - (0.5 * T) * (bias_jacobian @ ba))
-            g = float(normal_gravity(lat, height))
-            v_mid = v + 0.5 * CV
-            v_mid[2] -= 0.5 * g * T
-            ve, vn, _ = v_mid.tolist()
-            meridian, east_radius, tangent = _radii(lat)
-            rm, re = meridian + height, east_radius + height
-            wn, wu = RATE * cos(lat), RATE * sin(lat)
-            transport = (-vn / rm, ve / re, ve * tangent / re)
-            rate = np.array((transport[0], wn + transport[1], wu + transport[2]))
-            coriolis = _cross((transport[0], 2 * wn + transport[1], 2 * wu + transport[2]))
-            acceleration = -(coriolis @ v_mid)
-            acceleration[2] -= g
-            # The axes turn while the force acts: on average by half of their turn.
-            acceleration -= 0.5 * (_cross(rate.tolist()) @ CV)
-            apparent_gravity[j], frame_rate[j] = acceleration, rate
-
-            moved = (v * T + CP + acceleration * (0.5 * T * T)).tolist()
-            v = v + CV + acceleration * T
-            CA = C @ bias_jacobian
-            F[0:3, 3:6] = T * eye
-            F[0:3, 6:9] = -_cross(CP.tolist())
-            F[0:3, 12:15] = CA * (-0.5 * T)
-            F[3:6, 3:6] = eye - coriolis * T
-            F[3:6, 6:9] = -_cross(CV.tolist())
-            F[3:6, 9:12] = C @ by_gyro[j]
-            F[3:6, 12:15] = -CA
-            turned = eye - _cross((rate * T).tolist())
-            F[6:9, 4] = (T / rm, 0.0, 0.0)
-            F[6:9, 3] = (0.0, -T / re, -T * tangent / re)
-            F[6:9, 6:9] = turned
-            F[6:9, 9:12] = -CA
-            C = _exp(-T * rate) @ C @ _exp(-(bias_jacobian @ bg)) @ steps.turn[j]
-            middle = lat + 0.5 * moved[1] / rm
-            lat += moved[1] / rm
-            lon += moved[0] / (re * cos(middle))
-            height += moved[2]
+            j = k - 1
+            at, v, C, gravity = _step(steps, j, by_gyro[j], (lat, lon, height), v, C, bg, ba, F)
+            (lat, lon, height), (apparent_gravity[j], frame_rate[j]) = at, gravity
             P = F @ P @ F.T + Q[j]
             transition[k] = F
         predicted[k] = P
 
         if has_position[k] or has_velocity[k]:
-            H = np.zeros((6, 15))
-            z = np.zeros(6)
-            if has_position[k]:
-                arm = C @ lever_arm[k]
-                meridian, east_radius, _ = _radii(lat)
-                measured = fixes.geodetic[k].tolist()
-                east = (east_radius + height) * cos(lat)
-                z[0:3] = (
-                    wrapped(measured[1] - lon) * east,
-                    (measured[0] - lat) * (meridian + height),
-                    measured[2] - height,
-                )
-                z[0:3] -= arm
-                H[0:3, 0:3] = eye
-                H[0:3, 6:9] = -_cross(arm.tolist())
-            if has_velocity[k]:
-                earth = np.array((0.0, RATE * cos(lat), RATE * sin(lat)))
-                omega = fixes.turning[k] - bg - earth @ C
-                lever_cross = _cross(lever_arm[k].tolist())
-                turning = C @ -(lever_cross @ omega)
-                z[3:6] = fixes.velocity[k] - v - turning
-                H[3:6, 3:6] = eye
-                H[3:6, 6:9] = -_cross(turning.tolist())
-                H[3:6, 9:12] = C @ lever_cross
-            R = np.concatenate([fixes.position_variance[k], fixes.velocity_variance[k]])
-            if not (has_position[k] and has_velocity[k]):
-                rows = slice(0, 3) if has_position[k] else slice(3, 6)
-                H, z, R = H[rows], z[rows], R[rows]
+            at = (lat, lon, height)
+            H, z, R = _measured(fixes, k, has_position[k], has_velocity[k], at, v, C, bg)
             K, P = update(P, H, R)
             x = K @ z
             correction[k] = x
@@ -249,6 +184,104 @@ def run_filter(
     motion = (time, geodetic, velocity, nRb, gyro_bias, accel_bias)
     track = FilteredTrack(*motion, filtered, apparent_gravity, frame_rate)
     return ForwardPass(track, transition, predicted, correction)
+
+
+def _step(
+    steps: Steps,
+    j: int,
+    by_gyro: Array,
+    at: tuple[float, float, float],
+    v: Array,
+    C: Array,
+    bg: Array,
+    ba: Array,
+    F: Array,
+) -> tuple[tuple[float, float, float], Array, Array, tuple[Array, Array]]:
+    """Return position, velocity and attitude after step j, with apparent gravity and frame rate.
+
+    The transition of the errors is written to F (15, 15); its zeros and ones stay.
+    """
+    lat, lon, height = at
+    T = float(steps.duration[j])
+    bias_jacobian = steps.bias_jacobian[j]
+    CV = C @ (steps.dv[j] - bias_jacobian @ ba + by_gyro @ bg)
+    CP = C @ (steps.dp[j] - (0.5 * T) * (bias_jacobian @ ba))
+    g = float(normal_gravity(lat, height))
+    v_mid = v + 0.5 * CV
+    v_mid[2] -= 0.5 * g * T
+    ve, vn, _ = v_mid.tolist()
+    meridian, east_radius, tangent = _radii(lat)
+    rm, re = meridian + height, east_radius + height
+    wn, wu = RATE * cos(lat), RATE * sin(lat)
+    transport = (-vn / rm, ve / re, ve * tangent / re)
+    rate = np.array((transport[0], wn + transport[1], wu + transport[2]))
+    coriolis = _cross((transport[0], 2 * wn + transport[1], 2 * wu + transport[2]))
+    acceleration = -(coriolis @ v_mid)
+    acceleration[2] -= g
+    # The axes turn while the force acts: on average by half of their turn.
+    acceleration -= 0.5 * (_cross(rate.tolist()) @ CV)
+
+    moved = (v * T + CP + acceleration * (0.5 * T * T)).tolist()
+    CA = C @ bias_jacobian
+    F[0:3, 3:6] = T * _EYE
+    F[0:3, 6:9] = -_cross(CP.tolist())
+    F[0:3, 12:15] = CA * (-0.5 * T)
+    F[3:6, 3:6] = _EYE - coriolis * T
+    F[3:6, 6:9] = -_cross(CV.tolist())
+    F[3:6, 9:12] = C @ by_gyro
+    F[3:6, 12:15] = -CA
+    F[6:9, 4] = (T / rm, 0.0, 0.0)
+    F[6:9, 3] = (0.0, -T / re, -T * tangent / re)
+    F[6:9, 6:9] = _EYE - _cross((rate * T).tolist())
+    F[6:9, 9:12] = -CA
+    turned = _exp(-T * rate) @ C @ _exp(-(bias_jacobian @ bg)) @ steps.turn[j]
+    middle = lat + 0.5 * moved[1] / rm
+    after = (lat + moved[1] / rm, lon + moved[0] / (re * cos(middle)), height + moved[2])
+    return after, v + CV + acceleration * T, turned, (acceleration, rate)
+
+
+def _measured(
+    fixes: Fixes,
+    k: int,
+    has_position: bool,
+    has_velocity: bool,
+    at: tuple[float, float, float],
+    v: Array,
+    C: Array,
+    bg: Array,
+) -> tuple[Array, Array, Array]:
+    """Return matrix, innovation and variances of the fix at event k."""
+    lat, lon, height = at
+    lever_arm = fixes.lever_arm if fixes.lever_arm.ndim == 1 else fixes.lever_arm[k]
+    H = np.zeros((6, 15))
+    z = np.zeros(6)
+    if has_position:
+        arm = C @ lever_arm
+        meridian, east_radius, _ = _radii(lat)
+        measured = fixes.geodetic[k].tolist()
+        east = (east_radius + height) * cos(lat)
+        z[0:3] = (
+            wrapped(measured[1] - lon) * east,
+            (measured[0] - lat) * (meridian + height),
+            measured[2] - height,
+        )
+        z[0:3] -= arm
+        H[0:3, 0:3] = _EYE
+        H[0:3, 6:9] = -_cross(arm.tolist())
+    if has_velocity:
+        earth = np.array((0.0, RATE * cos(lat), RATE * sin(lat)))
+        omega = fixes.turning[k] - bg - earth @ C
+        lever_cross = _cross(lever_arm.tolist())
+        turning = C @ -(lever_cross @ omega)
+        z[3:6] = fixes.velocity[k] - v - turning
+        H[3:6, 3:6] = _EYE
+        H[3:6, 6:9] = -_cross(turning.tolist())
+        H[3:6, 9:12] = C @ lever_cross
+    R = np.concatenate([fixes.position_variance[k], fixes.velocity_variance[k]])
+    if has_position and has_velocity:
+        return H, z, R
+    rows = slice(0, 3) if has_position else slice(3, 6)
+    return H[rows], z[rows], R[rows]
 
 
 def smooth(forward: ForwardPass[FilteredTrack]) -> FilteredTrack:

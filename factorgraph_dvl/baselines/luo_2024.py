@@ -24,8 +24,8 @@ from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # The tuning, which the paper leaves open ("set by the noise of the DVL and the accuracy of

@@ -35,9 +35,9 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross_variance, interpolate, rotate, skew
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.trial import Trial
 
 # Chosen: longest step, s, over which gravity and Coriolis terms count as constant.

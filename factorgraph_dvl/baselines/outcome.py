@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.rotations import (
     right_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: rows of a history, as many as a figure can show.

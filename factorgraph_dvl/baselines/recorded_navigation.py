@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, longest_gap
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.trial import Trial

@@ -18,20 +18,15 @@ import numpy as np
 
 from factorgraph_dvl.baselines.outcome import History
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import contradictions
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.depth import Depth
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
-from factorgraph_dvl.solution import (
-    Estimate,
-    Progress,
-    Residuals,
-    Solution,
-    Trajectory,
-    contradictions,
-)
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 Method = Literal["4sv-2ob", "4sv-3ob"]
@@ -103,7 +98,8 @@ def filter_planar(
     ConfigError, DataError
         If the trial has no compass, log, depth sensor or beacons, or no position to start from.
     """
-    heading, depth = trial.required(Heading).settings, trial.required(Depth).settings
+    for needed in (Heading, Depth):
+        trial.required(needed)
     if trial.initial_position is None:
         raise DataError(
             "the trial has no position to start from",
@@ -121,6 +117,34 @@ def filter_planar(
         *contradictions(filtered.innovations),
         *_depends_on_start(trial, method, mean, start_std, filtered),
     ]
+    value, P = filtered.state[-1, 2:], filtered.covariance[-1, 2:, 2:]
+    prior = _current_std(trial)
+    std = np.sqrt(np.diag(P))
+    estimate = Estimate(
+        "current_m_s", _NAMES, value, std, np.zeros(2), prior, (prior > 0.0) & (std <= 0.5 * prior)
+    )
+    limits = message("method_limits.all_ranges", method=str(method))
+    solution = Solution(
+        trial=trial.name,
+        inputs=trial.inputs,
+        solver=f"kalman-{method}",
+        body_axes=trial.body_axes,
+        converged=not contradicted,
+        iterations=filtered.time.size,
+        cost=np.nan,
+        estimates=(estimate,),
+        covariance=P,
+        trajectory=_trajectory(trial, filtered),
+        findings=(*trial.notes, *contradicted, Finding(Code.METHOD_LIMITS, limits)),
+    )
+    stds = np.sqrt(np.diagonal(filtered.covariance, axis1=1, axis2=2))
+    return solution, History(filtered.time, _NAMES, filtered.state[:, 2:], stds[:, 2:])
+
+
+def _trajectory(trial: Trial, filtered: Filtered) -> Trajectory:
+    """Return the filtered track with depth and heading, an epoch for each update."""
+    heading, depth = trial.required(Heading).settings, trial.required(Depth).settings
+    frame = trial.frame()
     m = filtered.time.size
     height = depth.sea_surface_height_m - _depth_at(trial, filtered.time)
     p = np.column_stack([filtered.state[:, :2], height - frame.height])
@@ -133,42 +157,15 @@ def filter_planar(
     rph[:, 2] = np.interp(filtered.time, *_heading(trial))
     rph[:, 2] %= 2.0 * np.pi
     rph_cov[:, 2, 2] = heading.std_rad**2
-    value, P = filtered.state[-1, 2:], filtered.covariance[-1, 2:, 2:]
-    prior = _current_std(trial)
-    std = np.sqrt(np.diag(P))
-    estimate = Estimate(
-        "current_m_s", _NAMES, value, std, np.zeros(2), prior, (prior > 0.0) & (std <= 0.5 * prior)
+    return Trajectory(
+        time=filtered.time,
+        geodetic=np.stack([lat, lon, height], axis=1),
+        velocity=np.column_stack([filtered.velocity, np.zeros(m)]),
+        rph=rph,
+        position_cov=position_cov,
+        velocity_cov=velocity_cov,
+        rph_cov=rph_cov,
     )
-    solution = Solution(
-        trial=trial.name,
-        inputs=trial.inputs,
-        solver=f"kalman-{method}",
-        body_axes=trial.body_axes,
-        converged=not contradicted,
-        iterations=m,
-        cost=np.nan,
-        estimates=(estimate,),
-        covariance=P,
-        trajectory=Trajectory(
-            time=filtered.time,
-            geodetic=np.stack([lat, lon, height], axis=1),
-            velocity=np.column_stack([filtered.velocity, np.zeros(m)]),
-            rph=rph,
-            position_cov=position_cov,
-            velocity_cov=velocity_cov,
-            rph_cov=rph_cov,
-        ),
-        findings=(
-            *trial.notes,
-            *contradicted,
-            Finding(
-                Code.METHOD_LIMITS,
-                message("method_limits.all_ranges", method=str(method)),
-            ),
-        ),
-    )
-    stds = np.sqrt(np.diagonal(filtered.covariance, axis1=1, axis2=2))
-    return solution, History(filtered.time, _NAMES, filtered.state[:, 2:], stds[:, 2:])
 
 
 def run_filter(trial: Trial, method: Method | str, mean: Array, std: Array) -> Filtered:

@@ -13,8 +13,8 @@ import numpy as np
 
 from factorgraph_dvl.baselines.outcome import Estimated
 from factorgraph_dvl.baselines.point_sets import Points
+from factorgraph_dvl.estimates import OBSERVABLE
 from factorgraph_dvl.geometry.vectors import Array, skew
-from factorgraph_dvl.solution import OBSERVABLE
 
 # Chosen: multiple of the mean that is subtracted; correlated errors add up to more than the mean.
 _MARGIN = 5.0

@@ -21,6 +21,7 @@ from factorgraph_dvl.baselines.star_filter import (
 from factorgraph_dvl.baselines.strapdown import StrapdownSamples, prepare
 from factorgraph_dvl.baselines.summary import gnss_residuals
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.estimates import Residuals, Trajectory, as_estimates
 from factorgraph_dvl.geometry.celestial import off_vertical
 from factorgraph_dvl.geometry.earth import enu_from_ecef
 from factorgraph_dvl.geometry.rotations import (
@@ -32,18 +33,12 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import consistency_findings, contradictions, not_observable
+from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.sensors.star import Star
-from factorgraph_dvl.solution import (
-    Residuals,
-    Solution,
-    Trajectory,
-    as_estimates,
-    consistency_findings,
-    contradictions,
-    not_observable,
-)
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import InitialAttitude, Trial
 
 # Chosen: standard deviation of the stars' attitude as the prior of the SINS/GNSS filter, which
@@ -81,26 +76,7 @@ def calibrate_gyros(
     ConfigError, DataError
         If the trial has no star tracker, no epoch, no GNSS, or too few attitudes.
     """
-    star = trial.find(Star)
-    if star is None:
-        raise DataError(
-            "the trial has no star tracker", where="trial.yaml", expected="a star section"
-        )
-    if not trial.epoch:
-        raise ConfigError(
-            "the trial has no `epoch`",
-            where="trial.yaml key epoch",
-            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
-        )
-    settings = star.settings
-    if max(settings.mounting_std_deg) > _KNOWN_DEG:
-        raise ConfigError(
-            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
-            "deg), and this filter does not estimate it",
-            where="trial.yaml star.mounting_std_deg",
-            expected=f"at most {_KNOWN_DEG:g}",
-            hint="`solve` estimates the mounting",
-        )
+    star = _star_of(trial)
     frame = trial.frame()
     inc, _ = increments(trial.inertial)
     samples = prepare(inc, trial.inertial.settings)
@@ -146,6 +122,37 @@ def calibrate_gyros(
             solution, solver="kalman-liu-2020", findings=(*solution.findings, _IN_N)
         )
     return solution, outcome
+
+
+def _star_of(trial: Trial) -> Star:
+    """Return the star tracker, if this filter can use it.
+
+    Raises
+    ------
+    ConfigError, DataError
+        If there is none, or no epoch, or its mounting is not known.
+    """
+    star = trial.find(Star)
+    if star is None:
+        raise DataError(
+            "the trial has no star tracker", where="trial.yaml", expected="a star section"
+        )
+    if not trial.epoch:
+        raise ConfigError(
+            "the trial has no `epoch`",
+            where="trial.yaml key epoch",
+            expected="UTC of time_s = 0, such as 2022-10-12T02:00:00Z",
+        )
+    settings = star.settings
+    if max(settings.mounting_std_deg) > _KNOWN_DEG:
+        raise ConfigError(
+            f"the mounting of the star tracker is not known ({max(settings.mounting_std_deg):g} "
+            "deg), and this filter does not estimate it",
+            where="trial.yaml star.mounting_std_deg",
+            expected=f"at most {_KNOWN_DEG:g}",
+            hint="`solve` estimates the mounting",
+        )
+    return star
 
 
 def _drift(trial: Trial, tracks: list[AttitudeTrack], drift: Array, P: Array) -> Estimated:
@@ -202,7 +209,7 @@ def _summary(
     values, covariance = estimated.reported()
     estimates = as_estimates(estimated.parameters, values, covariance)
     residuals = (_star_residuals(tracks, attitudes), *gnss_residuals(trial, navigation))
-    findings = [*navigation.findings, *star.findings()]
+    findings = [*navigation.findings, *star_catalogue_findings([star])]
     if np.any(np.array(star.settings.mounting_std_deg) > 0.0):
         text = message(
             "method_limits.fixed",

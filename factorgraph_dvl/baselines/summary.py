@@ -12,24 +12,17 @@ from factorgraph_dvl.baselines.navigation import Navigation, NavigationMotion
 from factorgraph_dvl.baselines.outcome import Estimated, Outcome
 from factorgraph_dvl.baselines.point_sets import Points, residuals
 from factorgraph_dvl.baselines.recorded_navigation import RecordedNavigation
+from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory, as_estimates
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, wrapped
 from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import consistency_findings, contradictions, not_observable
 from factorgraph_dvl.sensors.dvl import Dvl
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
-from factorgraph_dvl.solution import (
-    Estimate,
-    Residuals,
-    Solution,
-    Trajectory,
-    as_estimates,
-    consistency_findings,
-    contradictions,
-    not_observable,
-)
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 WHITE_NOISE = Finding(

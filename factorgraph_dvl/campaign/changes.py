@@ -1,4 +1,4 @@
-"""Changes between trials: steps of one component, found with trial, size and probability."""
+"""Changes between trials: steps of one component, and components that walk at random."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize
+from scipy.special import chdtrc, ndtr, ndtri, stdtr
 
-from factorgraph_dvl.campaign.between_trials import fitted
 from factorgraph_dvl.campaign.information import Information
-from factorgraph_dvl.campaign.model import Effect, Fit, fit
-from factorgraph_dvl.campaign.supremum import normal_equivalent, supremum_probability
+from factorgraph_dvl.campaign.model import Effect, Fit, fit, fitted
 from factorgraph_dvl.geometry.vectors import Array
 
 # Chosen: probability by which a campaign without changes has one, over all components and trials.
@@ -152,3 +152,146 @@ def next_step(
 def _after(values: Array) -> Array:
     """Return sums over the trials after each but the last, (N - 1, ...)."""
     return np.asarray(np.cumsum(values[::-1], axis=0)[-2::-1])
+
+
+# Nodes of the quadrature over the correlation. Chosen: 1e-10 at correlations up to 0.9999.
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(48)
+
+
+def supremum_probability(largest: float, neighbours: Array) -> float:
+    """Return an upper bound of the probability that any |Z| of a chain exceeds a number.
+
+    P(any) ≤ Σ P(i) - Σ P(i and i + 1), for standard normal Z with correlations between neighbours
+    (Worsley 1982, Biometrika 69, 297-302): for a chain of steps it is close to the probability.
+
+    Parameters
+    ----------
+    largest : float
+        The number.
+    neighbours : ndarray, shape (M - 1,)
+        Correlation of each of the M statistics with the next.
+    """
+    single = 2.0 * float(ndtr(-largest))
+    pairs = _both_exceed(largest, neighbours)
+    return min(single * (neighbours.size + 1) - float(pairs.sum()), 1.0)
+
+
+def normal_equivalent(statistic: float, freedom: float) -> float:
+    """Return the normal statistic of the same tail probability as one of Student's t."""
+    tail = float(stdtr(freedom, -abs(statistic)))
+    return float(-ndtri(max(tail, 1e-300)))
+
+
+def _both_exceed(z: float, correlation: Array) -> Array:
+    """Return P(|X| > z and |Y| > z) of standard normal X, Y by their correlation, (M,).
+
+    By Plackett's identity, P(X > z, Y > z) = Q(z)² + ∫ exp(-z² / (1 + sin θ)) dθ / 2π from 0 to
+    arcsin ρ.
+    """
+    end = np.arcsin(np.clip(correlation, -1.0, 1.0))
+    theta = 0.5 * end[:, None] * (_NODES + 1.0)
+    total = np.zeros(end.size)
+    for sign in (1.0, -1.0):
+        # 1 + sin θ vanishes where one is minus the other.
+        below = np.maximum(1.0 + np.sin(sign * theta), 1e-300)
+        integral = 0.5 * end * (np.exp(-(z**2) / below) @ _WEIGHTS)
+        total += 2.0 * (float(ndtr(-z)) ** 2 + sign * integral / (2.0 * np.pi))
+    return np.clip(total, 0.0, 2.0 * float(ndtr(-z)))
+
+
+# Chosen: largest variance of a walk between two trials in units of that between trials.
+_LARGEST = 1e4
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A component that walks at random.
+
+    Parameters
+    ----------
+    component : int
+        That drifts.
+    variance : float
+        Of its walk, squared reported units a day, or a trial where the dates are not known.
+    probability : float
+        Of as clear a drift if there were none.
+    """
+
+    component: int
+    variance: float
+    probability: float
+
+    def effects(self, days: Array) -> list[Effect]:
+        """Return the walk as the sum of its steps between trials at times (N,)."""
+        trial = np.arange(days.size)
+        return [
+            Effect(self.component, np.where(trial > c, 1.0, 0.0), self.variance * dt)
+            for c, dt in enumerate(np.diff(days))
+            if dt > 0.0
+        ]
+
+
+def drift_of(
+    information: Information, found: Fit, component: int, days: Array
+) -> tuple[Drift, float] | None:
+    """Return the drift of a component and the gain in likelihood over none.
+
+    The walk is a sum of independent steps: with their scores g and information G, its restricted
+    likelihood given the variances q is that of g ~ N(0, G + G Q G). The variance of the component
+    between trials is estimated with it.
+
+    Parameters
+    ----------
+    information : Information
+        Of N trials, in order.
+    found : Fit
+        Without the drift.
+    component : int
+        That may drift.
+    days : ndarray, shape (N,)
+        Times of the trials.
+
+    Returns
+    -------
+    tuple of (Drift, float) or None
+        Drift and gain; None if no drift is more likely.
+    """
+    k = component
+    interval = np.sqrt(np.maximum(np.diff(days), 0.0))
+    unit = max(float(found.variance[k]), 1e-6)
+    days_long = float(interval.max(initial=0.0)) ** 2
+    if days_long <= 0.0:
+        return None
+
+    def negative(x: Array) -> float:
+        variance = found.variance.copy()
+        variance[k] = max(x[0], 0.0) * unit
+        base = fit(information, variance, found.effects)
+        score, matrix = _step_information(base, k)
+        scaled = interval * np.sqrt(max(x[1], 0.0) * unit / days_long)
+        normal = np.eye(score.size) + scaled[:, None] * matrix * scaled
+        root = np.linalg.cholesky(normal)
+        left = np.linalg.solve(root, scaled * score)
+        return -base.likelihood + float(np.log(np.diag(root)).sum() - 0.5 * left @ left)
+
+    best = min(
+        (
+            minimize(negative, start, method="L-BFGS-B", bounds=[(0.0, _LARGEST)] * 2)
+            for start in ([0.1, 0.1], [0.5, 0.01])
+        ),
+        key=lambda result: float(result.fun),
+    )
+    gain = -found.likelihood - float(best.fun)
+    variance = float(best.x[1]) * unit / days_long * float(found.scale[k]) ** 2
+    if gain <= 0.0 or variance <= 0.0:
+        return None
+    return Drift(k, variance, 0.5 * float(chdtrc(1, 2.0 * gain))), gain
+
+
+def _step_information(found: Fit, k: int) -> tuple[Array, Array]:
+    """Return scores (N - 1,) and their covariance of a step of a component after each trial."""
+    own = np.cumsum(found.weight[::-1, k, k])[-2::-1]
+    cross = np.cumsum((found.weight @ found.design)[::-1, k], axis=0)[-2::-1]
+    score = np.cumsum(found.score[::-1, k])[-2::-1]
+    later = np.maximum.outer(np.arange(own.size), np.arange(own.size))
+    return score, own[later] - cross @ found.covariance @ cross.T

@@ -11,16 +11,17 @@ import msgspec
 import numpy as np
 
 from factorgraph_dvl.campaign.joint_calibration import JointCalibration
-from factorgraph_dvl.campaign.monte_carlo import MonteCarlo, Statistic
+from factorgraph_dvl.campaign.monte_carlo import SEEDS_FOLDER, MonteCarlo, SeedRecord, Statistic
 from factorgraph_dvl.campaign.record import write_whole
-from factorgraph_dvl.campaign.seed_run import SEEDS_FOLDER, SeedRecord
 from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign
 from factorgraph_dvl.errors import as_text
+from factorgraph_dvl.estimates import OBSERVABLE, Estimate
 from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE, encode_calibration
 from factorgraph_dvl.files.tables import write_table
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import OBSERVABLE, Calibration, Estimate
+from factorgraph_dvl.quality.texts import text_of
+from factorgraph_dvl.solution import Calibration
 
 CAMPAIGN_FILE = "campaign.json"
 TRIALS_FILE = "trials.parquet"
@@ -127,7 +128,7 @@ def campaign_content(campaign: Campaign) -> dict[str, Any]:
                 "solved": t.record.done,
                 "grade": None if t.calibration is None else t.calibration.verdict.grade,
                 "used": not t.unused,
-                "reason": str(t.unused),
+                "reason": text_of(t.unused),
                 "wall_s": t.record.wall_s,
                 "cpu_s": t.record.cpu_s,
                 "peak_bytes": t.record.peak_bytes,
@@ -246,7 +247,7 @@ def _trial_columns(campaign: Campaign) -> dict[str, np.ndarray]:
         "folder": np.array([f"{TRIALS_FOLDER}/{t.label}" for t in trials]),
         "epoch": np.array([t.record.epoch for t in trials]),
         "grade": np.array([t.calibration.verdict.grade if t.calibration else "" for t in trials]),
-        "reason": np.array([str(t.unused) for t in trials]),
+        "reason": np.array([text_of(t.unused) for t in trials]),
         "wall_s": np.array([t.record.wall_s for t in trials]),
         "cpu_s": np.array([t.record.cpu_s for t in trials]),
         "peak_bytes": np.array([float(t.record.peak_bytes) for t in trials]),

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.analysis.comparison.calibration_difference import same_branch
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import CALIBRATED
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import ParameterSpec
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.solution import Calibration
 
 # What stays as it was installed from one trial to the next; all other parameters, such as biases
 # of the IMU, currents and clocks, are those of the day.

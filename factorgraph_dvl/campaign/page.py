@@ -16,12 +16,16 @@ from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.campaign.trials import Campaign, CampaignTrial
 from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.notation import at_precision, split_unit, with_std
+from factorgraph_dvl.quality.texts import chinese, component_names, text_of
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
     Section,
     both,
+    component_cell,
     element,
     paragraph,
     said,
@@ -29,10 +33,6 @@ from factorgraph_dvl.report.html.markup import (
     table,
 )
 from factorgraph_dvl.report.html.page import whole_page
-from factorgraph_dvl.report.html.sections import component_cell
-from factorgraph_dvl.report.html.words import chinese, component_names
-from factorgraph_dvl.report.text import at_precision, split_unit, with_std
-from factorgraph_dvl.sensors.message import message
 
 # Of a panel, in pixels.
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 900, 190, 90, 20, 12, 24
@@ -210,7 +210,7 @@ def _panel(campaign: Campaign, joint: JointCalibration, k: int, out: Path) -> Ht
 
     outline = " ".join([*line(centre + std), *reversed(list(line(centre - std)))])
     heading = message("campaign.history", name=name)
-    label, own = escape(heading.text()), escape(heading.text("zh"))
+    label, own = escape(text_of(heading)), escape(text_of(heading, "zh"))
     parts = [
         f'<svg class="history" viewBox="0 0 {_WIDTH} {_HEIGHT}" role="group" '
         f'aria-label="{label}" data-en="{label}" data-zh="{own}">'

@@ -19,7 +19,7 @@ from factorgraph_dvl.campaign.trial_run import TRIALS_FOLDER
 from factorgraph_dvl.errors import ConfigError, DataError, as_text
 from factorgraph_dvl.files.calibration_file import load_calibration
 from factorgraph_dvl.geometry.units import DAY
-from factorgraph_dvl.sensors.message import Message, message
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.settings.files import open_file
 from factorgraph_dvl.solution import Calibration
 

@@ -6,12 +6,13 @@ import os
 import sys
 from typing import NoReturn
 
+from factorgraph_dvl.cli.exit_codes import INTERRUPTED
+
 
 def main(argv: list[str] | None = None) -> NoReturn:
     """Run the command line and exit.
 
-    The exit code is 0 if it is done, 1 if it could not deliver, 2 for bad input or usage, 130
-    after an interrupt.
+    `cli.exit_codes` says with which code.
 
     Parameters
     ----------
@@ -26,7 +27,7 @@ def main(argv: list[str] | None = None) -> NoReturn:
     except KeyboardInterrupt:
         if sys.stderr is not None:
             sys.stderr.write("error: interrupted\n")
-        sys.exit(130)
+        sys.exit(INTERRUPTED)
 
 
 def _run(args: list[str]) -> NoReturn:

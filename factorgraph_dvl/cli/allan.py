@@ -31,8 +31,8 @@ def allan(
     from factorgraph_dvl.analysis.static_noise import static_noise
     from factorgraph_dvl.files.folders import new_folder
     from factorgraph_dvl.files.tables import read_table
+    from factorgraph_dvl.report.figure_files import figure_files
     from factorgraph_dvl.report.files.imu_noise import imu_yaml, noise_table
-    from factorgraph_dvl.report.text import figure_files
     from factorgraph_dvl.sensors.imu import COLUMNS, Imu, ImuSettings
 
     owned = (*figure_files(_FIGURE), _KEYS)

@@ -1,26 +1,94 @@
-"""The application: its commands, its errors, its exit codes."""
+"""The application: its commands, its output streams, its errors."""
 
 from __future__ import annotations
 
 import atexit
 import gc
+import io
 import os
 import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout, suppress
 from io import StringIO
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from factorgraph_dvl.cli import interrupts
 from factorgraph_dvl.cli.commands import Commands, lost_folder
-from factorgraph_dvl.cli.options import INTERRUPTED, claims
-from factorgraph_dvl.cli.streams import guard_streams, output_failure
+from factorgraph_dvl.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, NO_RESULT, exit_code_of
+from factorgraph_dvl.cli.options import claims
 from factorgraph_dvl.errors import FactorgraphDvlError, OutputError, printable
 
 if TYPE_CHECKING:
     from factorgraph_dvl.cli.events import FailureKind
+
+
+class _Stream(io.FileIO):
+    """A descriptor that stores its first failure instead of raising it, and then drops output."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any, /) -> int:
+        if self.failure is None:
+            try:
+                return super().write(data) or 0
+            except OSError as error:
+                self.failure = error
+        return memoryview(data).nbytes
+
+
+def guard_streams() -> None:
+    """Drop output that cannot be written instead of failing.
+
+    A stream that a caller has replaced is not changed; a closed one discards its output.
+    """
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        stream = getattr(sys, name)
+        if stream is None:
+            _occupy(number)
+        elif stream is not getattr(sys, f"__{name}__") or _is_guarded(stream):
+            continue
+        else:
+            stream.flush()
+        guarded = io.TextIOWrapper(
+            io.BufferedWriter(_Stream(number, "w", closefd=False)),
+            # A terminal without µ must not fail a run.
+            encoding=getattr(stream, "encoding", "utf-8"),
+            errors="replace",
+            line_buffering=os.isatty(number) or number == 2,
+        )
+        setattr(sys, name, guarded)
+        setattr(sys, f"__{name}__", guarded)
+
+
+def _is_guarded(stream: Any) -> bool:
+    return isinstance(_raw(stream), _Stream)
+
+
+def _raw(stream: Any) -> Any:
+    return getattr(getattr(stream, "buffer", None), "raw", None)
+
+
+def output_failure() -> OSError | None:
+    """Return why results could not be printed; None if they were.
+
+    A reader that closes the pipe, such as `head`, is not a failure.
+    """
+    if not _is_guarded(sys.stdout):
+        return None
+    sys.stdout.flush()
+    failure: OSError | None = _raw(sys.stdout).failure
+    return None if isinstance(failure, BrokenPipeError) else failure
+
+
+def _occupy(number: int) -> None:
+    # Otherwise the next file to be opened would get this descriptor.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    if nowhere != number:
+        os.dup2(nowhere, number)
+        os.close(nowhere)
+
 
 _NAME = "factorgraph-dvl"
 # Objects made before garbage is collected. Chosen: some ten megabytes.
@@ -58,7 +126,7 @@ def run(args: list[str]) -> NoReturn:
             raise
         complete = "" if done.code else "; the files of this run are complete"
         message = f"standard output cannot be written ({failure.strerror}){complete}"
-        _fail(message, _code_of(done) or 1, args, "output")
+        _fail(message, _code_of(done) or NO_RESULT, args, "output")
 
 
 def _run_with_events(args: list[str]) -> NoReturn:
@@ -72,7 +140,7 @@ def _run_with_events(args: list[str]) -> NoReturn:
                 _emit_help(args)
             # Typer would print its help.
             if not set(args) - set(_EVERYWHERE):
-                _fail("the command is missing", 2, args, "usage")
+                _fail("the command is missing", BAD_INPUT, args, "usage")
             _run(args)
         except SystemExit as done:
             # The last event states the exit code: no interrupt may change it any more.
@@ -99,7 +167,7 @@ def _emit_help(args: list[str]) -> NoReturn:
     with redirect_stdout(StringIO()) as shown, suppress(SystemExit):
         _call(args)
     events.emit(events.Text(shown.getvalue()))
-    sys.exit(0)
+    sys.exit(DONE)
 
 
 def _call(args: list[str]) -> None:
@@ -121,7 +189,7 @@ def _run(args: list[str]) -> NoReturn:
             # Said without rich, which may be what was being loaded.
             raise KeyboardInterrupt from error
         _end_with(error, args)
-    sys.exit(0)
+    sys.exit(DONE)
 
 
 def _is_interrupt(error: BaseException | None) -> bool:
@@ -148,23 +216,28 @@ def _end_with(error: BaseException, args: list[str]) -> NoReturn:
         for note in getattr(error, "__notes__", ()):
             warn(note)
         parts = {name: getattr(error, name) for name in ("what", "where", "expected", "hint")}
-        _fail(str(error), error.exit_code, args, _kind_of(error), parts)
+        _fail(str(error), exit_code_of(error), args, _kind_of(error), parts)
     if isinstance(error, OSError):
         name = error.filename if error.filename is not None else "a file"
-        _fail(f"{name}: {error.strerror or error}", 2, args, "system")
+        _fail(f"{name}: {error.strerror or error}", exit_code_of(error), args, "system")
     if not isinstance(error, Exception):
         raise error
     # Typer's errors of usage have no public base class.
     if hasattr(error, "format_message"):
-        _fail(error.format_message(), 2, args, "usage")
+        _fail(error.format_message(), exit_code_of(error), args, "usage")
     hint = "" if "--debug" in args else ". Run with --debug to see where"
-    _fail(f"internal error: {type(error).__name__}: {error}{hint}", 1, args, "internal")
+    _fail(
+        f"internal error: {type(error).__name__}: {error}{hint}",
+        exit_code_of(error),
+        args,
+        "internal",
+    )
 
 
 def _kind_of(error: FactorgraphDvlError) -> FailureKind:
     if isinstance(error, OutputError):
         return "output"
-    return "input" if error.exit_code == 2 else "result"
+    return "input" if exit_code_of(error) == BAD_INPUT else "result"
 
 
 def _fail(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import CountLine, print_folder, stderr, stdout, warn
+from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -141,9 +142,8 @@ def _run_seeds(
     quiet: bool,
 ) -> None:
     from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, write_seeds
-    from factorgraph_dvl.campaign.monte_carlo import monte_carlo
+    from factorgraph_dvl.campaign.monte_carlo import SeedRecord, monte_carlo, run_seed
     from factorgraph_dvl.campaign.page import write_seed_page
-    from factorgraph_dvl.campaign.seed_run import SeedRecord, run_seed
     from factorgraph_dvl.simulation import load_scenario
 
     # One error now, in place of one for each seed.
@@ -202,14 +202,16 @@ def _run(
 
 def _print_campaign(found: Campaign) -> None:
     console = stdout()
+    from factorgraph_dvl.quality.texts import text_of
+
     unused = [t for t in found.trials if t.unused]
     for t in unused:
-        warn(f"{t.label} is not used: {t.unused}")
+        warn(f"{t.label} is not used: {text_of(t.unused)}")
     joint = found.joint
     if joint is None:
         warn("no trial has a result that can be used: there is no joint calibration")
         return
-    from factorgraph_dvl.report.text import with_std
+    from factorgraph_dvl.quality.notation import with_std
 
     std = [float(v) ** 0.5 for v in joint.covariance.diagonal()]
     for k, name in enumerate(joint.information.names):
@@ -226,7 +228,7 @@ def _print_campaign(found: Campaign) -> None:
 
 
 def _end(failed: int, count: int) -> None:
-    """End with exit code 1 if runs have no result."""
+    """End with `NO_RESULT` if runs have no result."""
     if failed:
         stderr().print(f"error: {failed} of {count} runs failed", markup=False, style="red")
-        raise typer.Exit(1)
+        raise typer.Exit(NO_RESULT)

@@ -29,9 +29,8 @@ from factorgraph_dvl.errors import as_text, printable
 if TYPE_CHECKING:
     from types import TracebackType
 
-    from rich.table import Table
-
-    from factorgraph_dvl.sensors.finding import Finding
+    from factorgraph_dvl.quality.finding import Finding
+    from factorgraph_dvl.report.table import Table
     from factorgraph_dvl.solution import Solution
 
 # Chosen: width of tables in a file or a pipe, columns; that of a page or a mail.
@@ -249,30 +248,26 @@ def print_table(table: Table, *leave_out: str) -> None:
     *leave_out : str
         Headers of columns that may be left out, the least important first.
     """
-    from factorgraph_dvl.report.terminal.tables import fitted, least_width_of
+    from factorgraph_dvl.report.table import plain
+    from factorgraph_dvl.report.terminal.tables import least_width_of, rendered
 
     if events.active():
-        cells = [[_plain(cell) for cell in column.cells] for column in table.columns]
-        rows = [list(row) for row in zip(*cells, strict=True)]
-        header = [_plain(column.header) for column in table.columns]
-        events.emit(events.Table(_plain(table.title or ""), header, rows))
+        rows = [[_lines(plain(cell)) for cell in row] for row in table.rows]
+        header = [_lines(column.header) for column in table.columns]
+        events.emit(events.Table(_lines(table.title), header, rows))
         return
     console = stdout()
-    table = fitted(table, console.width, leave_out)
-    console.width = max(console.width, least_width_of(table))
-    console.print(table)
-
-
-def _plain(cell: Any) -> str:
-    return _lines(cell.plain if isinstance(cell, Text) else str(cell))
+    shown = rendered(table, console.width, leave_out)
+    console.width = max(console.width, least_width_of(shown))
+    console.print(shown)
 
 
 def print_error_budget(solution: Solution) -> None:
     """Print the largest causes of each standard deviation, if they are known."""
-    from factorgraph_dvl.report.terminal.error_budget import error_budget_table
+    from factorgraph_dvl.report.tables import error_budget_table
 
     if solution.error_budget:
-        print_table(error_budget_table(solution, width=stdout().width), "std")
+        print_table(error_budget_table(solution))
 
 
 def warn(message: str) -> None:
@@ -285,7 +280,7 @@ def warn(message: str) -> None:
 
 def found_event(finding: Finding) -> events.Found:
     """Return a finding as an event."""
-    from factorgraph_dvl.sensors.message import encoded
+    from factorgraph_dvl.message import encoded
 
     sensor, parameter, text = map(printable, (finding.sensor, finding.parameter, finding.text))
     code, own = finding.code, finding.message
@@ -301,7 +296,7 @@ def say(finding: Finding) -> None:
     if events.active():
         events.emit(found_event(finding))
         return
-    from factorgraph_dvl.report.terminal.tables import STYLES
+    from factorgraph_dvl.report.tables import STYLES
 
     line = printable(f"{finding.severity}: {finding}")
     stderr().print(Text(line, STYLES[finding.severity]), soft_wrap=True)

@@ -106,7 +106,7 @@ def _draw_crosscheck(check: CrossCheck, folder: Path, kind: str) -> None:
 
 
 def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
-    from factorgraph_dvl.report.terminal import crosscheck as tables
+    from factorgraph_dvl.report import crosscheck_tables as tables
 
     console = stdout()
     for side, path, solution in (("A", a, check.a), ("B", b, check.b)):
@@ -115,7 +115,7 @@ def _print_crosscheck(check: CrossCheck, a: Path, b: Path) -> None:
         grade = "" if verdict.grade == "good" else f", {verdict}"
         console.print(f"{side}: {path}{solver}{grade}", markup=False, soft_wrap=True)
     if check.components:
-        print_table(tables.component_table(check, width=console.width))
+        print_table(tables.component_table(check))
     if check.motion is not None:
         print_table(tables.motion_table(check.motion), "at s", "largest in σ", "which σ")
     for table in tables.truth_tables(check):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -26,14 +28,13 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter
     from factorgraph_dvl.analysis.dead_reckoning.integration import OrientationAt
-    from factorgraph_dvl.sensors.finding import Finding
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.finding import Finding
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.trial import Trial
 
 
@@ -78,16 +79,15 @@ def deadreckon(
     from factorgraph_dvl.files.motion_table import motion_columns
     from factorgraph_dvl.files.tables import write_table
     from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
-    from factorgraph_dvl.quality.refusal import explained
+    from factorgraph_dvl.plausibility.survey import explained
+    from factorgraph_dvl.quality.verdict import verdict_of
     from factorgraph_dvl.report.files.dead_reckoning import (
         OWNED,
         RESULT_FILE,
         TRACK_FILE,
         UNCALIBRATED_FILE,
-        error_table,
         to_json,
     )
-    from factorgraph_dvl.sensors.verdict import verdict_of
 
     read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
     claim_output(out, force=force, owned=OWNED, inputs=read)
@@ -104,15 +104,13 @@ def deadreckon(
             result = before_after(trial, values, source)
         progress("write")
         with new_folder(out, force=force, owned=OWNED) as folder:
-            for name, run in (
-                (TRACK_FILE, result.calibrated),
-                (UNCALIBRATED_FILE, result.uncalibrated),
-            ):
+            tracks = {TRACK_FILE: result.calibrated, UNCALIBRATED_FILE: result.uncalibrated}
+            for name, run in tracks.items():
                 write_table(folder / name, motion_columns(run.track.motion))
             if not no_figures:
                 reasons = () if own is None else own.verdict.reasons
-                verdict = verdict_of((*errors, *trial.notes, *findings, *reasons))
-                _draw(trial, result, folder, verdict, figures.value)
+                found = (*errors, *trial.notes, *findings, *reasons)
+                _draw(trial, result, folder, verdict_of(found), figures.value)
             about = {
                 "trial": trial.name,
                 "calibration": as_text(calibration),
@@ -121,6 +119,29 @@ def deadreckon(
                 "errors": list(map(str, errors)),
             }
             (folder / RESULT_FILE).write_bytes(to_json(result, about))
+    _print_errors(result)
+    _say(trial, result, (*errors, *trial.notes, *findings))
+    print_written(out)
+    end_with(verdict_of(errors))
+
+
+def _say(trial: Trial, result: BeforeAfter, findings: Sequence[Finding]) -> None:
+    """Print findings, and warn of a current and of pings without bottom lock."""
+    for finding in findings:
+        say(finding)
+    if trial.dvl is not None and trial.dvl.settings.reference == "water":
+        warn("the DVL measures velocity through the water: the track drifts with the current")
+    if result.calibrated.track.bridged > 0.0:
+        warn(
+            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged with the "
+            "velocity before and after"
+        )
+
+
+def _print_errors(result: BeforeAfter) -> None:
+    """Print the errors of the tracks, and how far they are known."""
+    from factorgraph_dvl.report.files.dead_reckoning import error_table
+
     if result.calibrated.score is None:
         warn("neither a reference nor GNSS covers the track, so its errors are unknown")
     else:
@@ -135,17 +156,6 @@ def deadreckon(
                 f"{result.scored_by} ends at {end:.1f} s, before the track ({last:.1f} s): "
                 f"distance and errors are valid up to {end:.1f} s"
             )
-    for finding in (*errors, *trial.notes, *findings):
-        say(finding)
-    if trial.dvl is not None and trial.dvl.settings.reference == "water":
-        warn("the DVL measures velocity through the water: the track drifts with the current")
-    if result.calibrated.track.bridged > 0.0:
-        warn(
-            f"{result.calibrated.track.bridged:.1f} s without bottom lock were bridged with the "
-            "velocity before and after"
-        )
-    print_written(out)
-    end_with(verdict_of(errors))
 
 
 def _default_attitude(trial: Trial) -> str:

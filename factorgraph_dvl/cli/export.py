@@ -14,7 +14,7 @@ from factorgraph_dvl.cli.options import Force
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from factorgraph_dvl.files.exporting.motion import ExportedMotion
+    from factorgraph_dvl.files.exporting.trajectories import ExportedMotion
 
 
 class ExportFormat(StrEnum):
@@ -79,8 +79,8 @@ def export(
 
 def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force: bool) -> None:
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.files.exporting.motion import exported_motion
-    from factorgraph_dvl.files.output_file import check_new_file, write_file
+    from factorgraph_dvl.files.exporting.trajectories import exported_motion
+    from factorgraph_dvl.files.folders import check_new_file, write_file
     from factorgraph_dvl.files.run_file import read_run
     from factorgraph_dvl.files.solution_folder import EXPORT_STEM, load_solution
 
@@ -105,7 +105,9 @@ def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force:
 
 
 def _writer(to: ExportFormat) -> Callable[[ExportedMotion, Path], None]:
-    from factorgraph_dvl.files.exporting import arrays, geographic, navigation, tum
+    from factorgraph_dvl.files.exporting import geographic, navigation
+    from factorgraph_dvl.files.exporting import trajectories as arrays
+    from factorgraph_dvl.files.exporting import trajectories as tum
 
     return {
         ExportFormat.TUM: tum.write_tum,

@@ -29,7 +29,7 @@ from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:
     from factorgraph_dvl.analysis.information.observability import Observability
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 
@@ -123,7 +123,7 @@ def _draw(view: Observability, folder: Path, verdict: Verdict, kind: str) -> Non
 
 def print_observability(view: Observability) -> None:
     """Print segments, marginals and weak directions."""
-    from factorgraph_dvl.report.terminal.observability import (
+    from factorgraph_dvl.report.observability_tables import (
         direction_lines,
         marginal_table,
         segment_table,
@@ -135,7 +135,7 @@ def print_observability(view: Observability) -> None:
     if view.point_set is not None:
         console.print(f"Singular values: {view.point_set.scaling}.", markup=False, soft_wrap=True)
     if view.marginals is not None:
-        print_table(marginal_table(view), "information from", "observable", "prior std")
+        print_table(marginal_table(view), "information from", "observable", "before the trial")
         for line in direction_lines(view.marginals):
             console.print(line, markup=False, highlight=False, soft_wrap=True)
     for warning in view.warnings:

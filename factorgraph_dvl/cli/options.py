@@ -39,8 +39,6 @@ Anyway = Annotated[
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", help="Do not show progress.")]
 
-# The exit code of an interrupt, as in Typer.
-INTERRUPTED = 130
 # Output folders of the running command; released when it ends.
 claims = ExitStack()
 

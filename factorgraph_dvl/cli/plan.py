@@ -14,6 +14,7 @@ from factorgraph_dvl.cli.console import (
     print_written,
     stdout,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.observability import print_observability, write_observability
 from factorgraph_dvl.cli.options import (
     Anyway,
@@ -24,7 +25,6 @@ from factorgraph_dvl.cli.options import (
     Quiet,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.verdict import end_with
 
 if TYPE_CHECKING:

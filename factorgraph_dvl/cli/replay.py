@@ -282,17 +282,18 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
     import numpy as np
 
     from factorgraph_dvl.analysis.error_statistics import calibration_errors
-    from factorgraph_dvl.report.terminal.tables import (
+    from factorgraph_dvl.report.tables import (
         calibration_table,
         convergence_table,
         good_enough_line,
+        known_errors,
     )
 
     print_verdict(solution)
     console = stdout()
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None
-    print_table(calibration_table(solution, errors, width=console.width))
+    print_table(calibration_table(solution, known_errors(errors)))
     start = float(trial.body_sensor.time[0])
     print_table(convergence_table(found, start))
     plain = 1e3 * record.latency[~record.solved]

@@ -45,7 +45,7 @@ def report(
       factorgraph-dvl report out-batch out-kalman --out comparison.html
     """
     from factorgraph_dvl.errors import ConfigError
-    from factorgraph_dvl.files.output_file import write_file
+    from factorgraph_dvl.files.folders import write_file
     from factorgraph_dvl.files.solution_folder import REPORT_FILE
     from factorgraph_dvl.report.html.page import comparison_page, report_page
 

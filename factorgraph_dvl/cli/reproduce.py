@@ -45,7 +45,7 @@ def reproduce(
     """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.files.folders import new_folder
-    from factorgraph_dvl.report.text import figure_files
+    from factorgraph_dvl.report.figure_files import figure_files
     from factorgraph_dvl.reproduce import PAPERS
     from factorgraph_dvl.reproduce.page import selected, write_page
 

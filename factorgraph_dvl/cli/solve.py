@@ -19,6 +19,7 @@ from factorgraph_dvl.cli.console import (
     stdout,
     warn,
 )
+from factorgraph_dvl.cli.inspect import errors_in
 from factorgraph_dvl.cli.options import (
     Anyway,
     FigureKind,
@@ -31,7 +32,6 @@ from factorgraph_dvl.cli.options import (
     TrialPath,
     claim_output,
 )
-from factorgraph_dvl.cli.plausibility import errors_in
 from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_findings, print_verdict
 
@@ -162,7 +162,7 @@ def kalman(
 
     def run(trial: Trial, progress: ProgressLine) -> _Found:
         from factorgraph_dvl.baselines import calibrate
-        from factorgraph_dvl.quality.refusal import explained
+        from factorgraph_dvl.plausibility.survey import explained
 
         name = "nine-state-linear" if linear else method and method.value
         errors = errors_in(trial, anyway=anyway)
@@ -189,8 +189,8 @@ def _with_halves(
     """Return a solution with the difference of the trial's halves, if they can be solved."""
     from factorgraph_dvl.analysis.comparison.halves import compare_halves
     from factorgraph_dvl.errors import FactorgraphDvlError
-    from factorgraph_dvl.sensors.finding import Code, Finding
-    from factorgraph_dvl.sensors.message import message
+    from factorgraph_dvl.message import message
+    from factorgraph_dvl.quality.finding import Code, Finding
     from factorgraph_dvl.solvers.batch import solve as run_batch
 
     try:
@@ -244,7 +244,7 @@ def _solve_into(
             write_instrument(solution, folder)
             shown = history or along
             series = None if shown is None else (shown.time, shown.names, shown.std)
-            write_report(folder, str(out), solution, run_of(trial), series)
+            write_report(folder, str(out), solution, run_of(trial, solution.steps), series)
             if figures is not None:
                 with drawing():
                     _draw(trial, solution, history, folder / FIGURES_FOLDER, figures.value)
@@ -309,10 +309,11 @@ def write_instrument(solution: Solution, folder: Path) -> None:
 
 def _print_solution(trial: Trial, found: _Found) -> None:
     from factorgraph_dvl.analysis.error_statistics import calibration_errors, paper_accuracy
-    from factorgraph_dvl.report.terminal.tables import (
+    from factorgraph_dvl.report.tables import (
         calibration_table,
         halves_table,
         hypothesis_table,
+        known_errors,
         rejected_line,
     )
 
@@ -321,7 +322,7 @@ def _print_solution(trial: Trial, found: _Found) -> None:
     truth = trial.calibration_truth
     if solution.estimates:
         errors = calibration_errors(solution, truth) if truth else None
-        print_table(calibration_table(solution, errors, width=stdout().width))
+        print_table(calibration_table(solution, known_errors(errors)))
         print_error_budget(solution)
         accuracy = paper_accuracy(solution.estimates, truth)
         if isfinite(accuracy):

@@ -9,16 +9,17 @@ from rich.text import Text
 
 from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import found_event, say, stderr, stdout
+from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.errors import printable
 
 if TYPE_CHECKING:
-    from factorgraph_dvl.sensors.verdict import Verdict
+    from factorgraph_dvl.quality.verdict import Verdict
     from factorgraph_dvl.solution import Solution
 
 
 def print_verdict(solution: Solution) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
-    from factorgraph_dvl.report.terminal.tables import verdict_line
+    from factorgraph_dvl.report.tables import verdict_line
 
     verdict = solution.verdict
     if events.active():
@@ -30,7 +31,7 @@ def print_verdict(solution: Solution) -> None:
 
 def print_findings(solution: Solution) -> None:
     """Print the reasons of the verdict, then notes that tables do not show."""
-    from factorgraph_dvl.sensors.finding import Code
+    from factorgraph_dvl.quality.finding import Code
 
     for reason in solution.verdict.reasons:
         say(reason)
@@ -42,10 +43,10 @@ def print_findings(solution: Solution) -> None:
 
 
 def end_with(verdict: Verdict) -> None:
-    """End the command with exit code 1 if a result is not to be used."""
+    """End the command with `NO_RESULT` if a result is not to be used."""
     if verdict.grade == "do not use":
         text = printable(f"error: not to be used: {verdict.reasons[0]}")
         if events.active():
-            raise typer.Exit(1)
+            raise typer.Exit(NO_RESULT)
         stderr().print(Text(text, "red"), soft_wrap=True)
-        raise typer.Exit(1)
+        raise typer.Exit(NO_RESULT)

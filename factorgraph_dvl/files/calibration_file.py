@@ -13,22 +13,23 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.errors import DataError, printable
+from factorgraph_dvl.estimates import Cause, Estimate, Noise
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import encoded, message
+from factorgraph_dvl.quality.finding import Code, Finding, Severity
+from factorgraph_dvl.quality.texts import decoded
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, Grade, VerdictGrade
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED
-from factorgraph_dvl.sensors.finding import Code, Finding, Severity
 from factorgraph_dvl.sensors.fingerprint import PATTERN
-from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
-from factorgraph_dvl.sensors.message import decoded, encoded, message
-from factorgraph_dvl.sensors.verdict import VerdictGrade
 from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import check_epoch
-from factorgraph_dvl.solution import Calibration, Cause, Estimate, Noise, Solution
+from factorgraph_dvl.solution import Calibration, Solution
 
 CALIBRATION_FILE = "calibration.json"
 

@@ -17,7 +17,27 @@ _TABLES: tuple[FrameTable, ...] = ("calibration", "trajectory", "residuals")
 
 
 def to_dataframe(solution: Solution, table: FrameTable = "calibration") -> Any:
-    """Return a part of a solution as a pandas DataFrame; see `Solution.to_dataframe`."""
+    """Return a part of a solution as a pandas DataFrame, in the units of files.
+
+    Parameters
+    ----------
+    solution : Solution
+        What a solver found.
+    table : {'calibration', 'trajectory', 'residuals'}, optional
+        A row for each component, each epoch, or each component of each measurement.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such table, or pandas is not installed (extra `notebook`).
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> fd.to_dataframe(solution).loc["scale_error", "grade"]
+    'green'
+    """
     if table not in _TABLES:
         raise ConfigError(f"table is {table!r}", expected=f"one of {', '.join(_TABLES)}")
     pandas = _library("pandas")
@@ -32,7 +52,28 @@ def to_dataframe(solution: Solution, table: FrameTable = "calibration") -> Any:
 
 
 def to_xarray(solution: Solution) -> Any:
-    """Return a solution as an xarray Dataset; see `Solution.to_xarray`."""
+    """Return calibration, joint covariance and trajectory as an xarray Dataset.
+
+    Dimensions are `component` (`other_component` for the columns of the covariance) and
+    `time_s`; units are those of files and stand in the names.
+
+    Parameters
+    ----------
+    solution : Solution
+        What a solver found.
+
+    Raises
+    ------
+    ConfigError
+        If xarray is not installed (extra `notebook`).
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> solution = fd.solve(fd.simulate("examples/short.yaml", seed=1))
+    >>> fd.to_xarray(solution).sizes["component"] == len(solution.order)
+    True
+    """
     xarray = _library("xarray")
     order = list(solution.order)
     calibration = {

@@ -13,6 +13,7 @@ from msgspec import UnsetType
 from scipy.linalg import block_diag
 
 from factorgraph_dvl.errors import ConfigError, DataError
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.calibration_file import (
     check_usable,
     encode_calibration,
@@ -22,13 +23,13 @@ from factorgraph_dvl.files.folders import SETTINGS_FILE
 from factorgraph_dvl.geometry.celestial import seconds_between
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.catalogue import specs_of
 from factorgraph_dvl.sensors.dvl import CALIBRATED, Dvl
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, Imu
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import JointPrior
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.solution import Calibration
 from factorgraph_dvl.trial import Trial
 
 _Calibrated = TypeVar("_Calibrated", Dvl, Imu)

@@ -12,6 +12,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.errors import ConfigError, DataError, printable
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.files.calibration_file import (
     CALIBRATION_FILE,
     check_usable,
@@ -38,7 +39,7 @@ from factorgraph_dvl.sensors.records import check_finite, check_range
 from factorgraph_dvl.settings.ranges import out_of_range
 from factorgraph_dvl.settings.sections import Section
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text
-from factorgraph_dvl.solution import Calibration, Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Calibration, Solution
 from factorgraph_dvl.trial import Reference
 
 # How far the length of a direction may be off 1. Chosen: three digits.

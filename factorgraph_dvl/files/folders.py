@@ -1,14 +1,4 @@
-"""Output folders that appear complete or not at all, and that are replaced as a whole.
-
-A run writes to a working folder beside its output, `.NAME.factorgraph-dvl`, which it keeps
-locked: whoever gets the lock knows that no other run is writing, and that what it finds in
-there is left of one that was killed. The working folder holds
-
-- `partial`: a result that is being written; of the user's files it has links only;
-- `new`: a complete result that is about to trade places with the output;
-- `old`: the result that it replaced, or, if there is no output, is replacing;
-- `owned`: patterns of what the run writes. All other files are the user's.
-"""
+"""Output files and folders that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -17,13 +7,69 @@ import errno
 import fcntl
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
+from tempfile import TemporaryDirectory
 from threading import get_ident
 
 from factorgraph_dvl.errors import DataError, OutputError
+
+
+def check_new_file(path: Path, *, force: bool) -> None:
+    """Raise DataError unless a file can be written, and does not exist, or `force` is set."""
+    if path.is_dir():
+        raise DataError("is a folder", where=str(path), expected="the name of a file")
+    if not path.parent.is_dir():
+        raise DataError("the folder does not exist", where=str(path.parent), expected="a folder")
+    if path.exists() and not path.is_file():
+        raise DataError("is a pipe or a device", where=str(path), expected="the name of a file")
+    # A link that leads nowhere, too, would be replaced.
+    if os.path.lexists(path) and not force:
+        raise DataError(
+            "the file exists",
+            where=str(path),
+            expected="a new file",
+            hint="Choose another, or replace it with --force",
+        )
+
+
+def write_file(path: Path, write: Callable[[Path], object], *, force: bool = False) -> None:
+    """Write a file beside its place, and move it there when it is complete.
+
+    Parameters
+    ----------
+    path : path-like
+        Of the file.
+    write : callable of path-like, object
+        Writes the file to a path of the same name, and others beside it.
+    force : bool, default False
+        Replace the file that is there.
+
+    Raises
+    ------
+    DataError
+        As `check_new_file`.
+    OutputError
+        If it cannot be written.
+    """
+    check_new_file(path, force=force)
+    try:
+        with TemporaryDirectory(prefix=".factorgraph-dvl-", dir=path.parent) as folder:
+            partial = Path(folder) / path.name
+            write(partial)
+            # Files that belong to it lie beside it.
+            written = sorted(Path(folder).iterdir(), key=lambda file: file.name == path.name)
+            for file in written:
+                check_new_file(path.parent / file.name, force=force)
+            for file in written:
+                os.replace(file, path.parent / file.name)
+    except OSError as error:
+        raise OutputError(
+            f"cannot be written: {error.strerror}; nothing was changed there", where=str(path)
+        ) from error
+
 
 SETTINGS_FILE = "trial.yaml"
 _PARTIAL, _NEW, _OLD, _OWNED = "partial", "new", "old", "owned"

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.records import check_finite, check_possible, check_times, stack
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 COLUMNS = (

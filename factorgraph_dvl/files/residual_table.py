@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.tables import read_table
-from factorgraph_dvl.solution import Residuals
 
 _COLUMNS = ("time_s", "sensor", "component", "reason", "residual", "std", "unit")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -15,6 +16,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.convert import from_json
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.solution import SolverStep
 from factorgraph_dvl.trial import Trial
 
 RUN_FILE = "run.json"
@@ -35,6 +37,16 @@ class Inventory(msgspec.Struct):
     longest_interval_s: float
 
 
+class StepTaken(msgspec.Struct):
+    """A change of what the solver assumes, and what it took off the objective."""
+
+    round: int
+    change: str
+    objective: float
+    fall: float
+    largest_move_sigma: float
+
+
 class Run(msgspec.Struct):
     """What a solution came from; without times of the run, so that equal runs are equal."""
 
@@ -44,15 +56,18 @@ class Run(msgspec.Struct):
     settings: dict[str, dict[str, Any]]
     records: list[Inventory]
     truth: dict[str, Any] = {}
+    steps: list[StepTaken] = []
 
 
-def run_of(trial: Trial) -> Run:
+def run_of(trial: Trial, steps: Sequence[SolverStep] = ()) -> Run:
     """Return what a solution of a trial comes from.
 
     Parameters
     ----------
     trial : Trial
         The trial, as loaded.
+    steps : sequence of SolverStep, optional
+        What its solver changed of its assumptions.
     """
     records: list[Any] = list(trial.records)
     versions = {"python": platform.python_version()}
@@ -63,6 +78,10 @@ def run_of(trial: Trial) -> Run:
         settings={r.section: msgspec.to_builtins(r.settings) for r in records},
         records=[_inventory(r.section, r.time) for r in records],
         truth={name: np.asarray(v).tolist() for name, v in trial.calibration_truth.items()},
+        steps=[
+            StepTaken(i, s.change, s.objective, s.fall, s.largest_move_sigma)
+            for i, s in enumerate(steps)
+        ],
     )
 
 

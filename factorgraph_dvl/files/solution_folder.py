@@ -10,6 +10,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.estimates import Hypothesis, Trajectory
 from factorgraph_dvl.files.calibration_file import (
     CALIBRATION_FILE,
     encode_calibration,
@@ -31,7 +32,7 @@ from factorgraph_dvl.files.run_file import RUN_FILE
 from factorgraph_dvl.files.tables import read_header, read_table, release_memory, write_table
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Hypothesis, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 
 TRAJECTORY_FILE = "trajectory.csv"
 HISTORY_FILE = "history.csv"

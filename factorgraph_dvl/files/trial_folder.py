@@ -34,15 +34,15 @@ from factorgraph_dvl.files.trial_yaml import (
 )
 from factorgraph_dvl.files.truth_file import read_truth, truth_json
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.invalid_values import without_invalid_values
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.catalogue import AIDS, aid_types
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.invalid_values import without_invalid_values
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
 from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.yaml_file import parse_yaml, read_text

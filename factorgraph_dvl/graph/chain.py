@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import gtsam
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
@@ -15,7 +16,6 @@ from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
-from factorgraph_dvl.solution import Trajectory
 
 
 @dataclass(frozen=True)
@@ -233,6 +233,10 @@ class Chain(Protocol):
     @property
     def step_source(self) -> str | None:
         """Source of the noise of `steps`; None where there are none."""
+
+    @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of what ties the nodes, as far as models differ in it."""
 
     @property
     def interpolates(self) -> bool:

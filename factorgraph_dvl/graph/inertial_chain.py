@@ -11,6 +11,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
@@ -48,7 +49,6 @@ from factorgraph_dvl.imu.propagation import (
 from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Trial
 
 IMU_NOISE = "IMU noise"
@@ -142,6 +142,11 @@ class InertialChain:
         walks = [self.imu.accel_bias_walk_root_psd, self.imu.gyro_bias_walk_root_psd]
         root_time = np.sqrt(np.diff(self.segments.node_time))[:, None]
         return np.maximum(root_time * np.repeat(walks, 3), LEAST_WALK)
+
+    @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of the steps of walking biases."""
+        return 2.0 * float(np.log(self.bias_steps).sum()) if self.walking else 0.0
 
     @property
     def middle(self) -> float:

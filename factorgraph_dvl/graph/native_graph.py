@@ -3,19 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Protocol
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes
 from factorgraph_dvl.graph.chain import Chain
-from factorgraph_dvl.graph.priors import value_at
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.priors import Tilt, value_at
 from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.sensors.parameters import Parameter
 
 
-def native_graph(problem: Problem) -> gtsam.NonlinearFactorGraph:
+class WholeProblem(Protocol):
+    """What is read of a problem."""
+
+    graph: gtsam.NonlinearFactorGraph
+    chain: Chain
+    parameters: tuple[Parameter, ...]
+    processes: tuple[Process, ...]
+    tilt: Tilt | None
+
+    @property
+    def bound(self) -> tuple[BoundObservation, ...]:
+        """The observations as they are tied to the chain."""
+
+    @property
+    def imu_errors(self) -> ImuErrors | None:
+        """Errors of the IMU that are estimated, None if there are none."""
+
+    def key(self, name: str) -> int:
+        """Return the key of a parameter."""
+
+    def processes_of(self, bound: BoundObservation) -> Processes:
+        """Return the correlated errors of measurements."""
+
+    def prior_values(self) -> dict[str, Array]:
+        """Return the values of all parameters before the trial."""
+
+
+def native_graph(problem: WholeProblem) -> gtsam.NonlinearFactorGraph:
     """Return the nonlinear graph that a problem linearises in bulk.
 
     Factors from node to node, with gravity per segment where there is an IMU, and all priors are
@@ -64,7 +93,9 @@ def custom_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), list(every), error)
 
 
-def _measurement_factor(problem: Problem, bound: BoundObservation, i: int) -> gtsam.CustomFactor:
+def _measurement_factor(
+    problem: WholeProblem, bound: BoundObservation, i: int
+) -> gtsam.CustomFactor:
     """Return the factor of one measurement."""
     single = bound.single(i)
     processes, parameters = problem.processes_of(bound), bound.parameters(problem.parameters)
@@ -87,7 +118,7 @@ def _measurement_factor(problem: Problem, bound: BoundObservation, i: int) -> gt
     return custom_factor(every, bound.sizes(processes, parameters), rows, linearize)
 
 
-def _step_factors(problem: Problem) -> Iterator[gtsam.CustomFactor]:
+def _step_factors(problem: WholeProblem) -> Iterator[gtsam.CustomFactor]:
     """Yield the factors from node to node that GTSAM does not have, one for each step."""
     chain = problem.chain
     for k in range(chain.count if chain.interpolates else 0):
@@ -106,7 +137,7 @@ def _step_factor(chain: Chain, k: int, every: Sequence[int]) -> gtsam.CustomFact
 
 
 def _parameters_at(
-    problem: Problem, every: Sequence[int]
+    problem: WholeProblem, every: Sequence[int]
 ) -> Callable[[gtsam.Values], Mapping[str, Array]]:
     """Return a function of values to all parameters, the others than of some keys as zero."""
     own = set(every)

@@ -35,6 +35,7 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
 from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
+from factorgraph_dvl.graph.native_graph import native_graph
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
     Tilt,
@@ -190,6 +191,8 @@ class Problem:
         1 where there are none. `weigh` applies them.
     long_run : mapping of str to ndarray
         By label, factors (d,) for noise that persists for some measurements; likewise.
+    gain : float
+        Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
     clock_tolerance : mapping of str to float
@@ -240,6 +243,7 @@ class Problem:
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
         self.long_run: Mapping[str, Array] = {}
+        self.gain = 0.0
         self.robust_weights: Mapping[str, Array] = {}
         self.clock_tolerance: Mapping[str, float] = {}
         self.bound_at = {**self.prior_values(), **(start or {})}
@@ -399,6 +403,15 @@ class Problem:
             values, states, parameters, motions, residuals, own_cost + cost, own_cost, imu
         )
 
+    def without_tilt(self, evaluation: Evaluation) -> Evaluation:
+        """Return an evaluation whose cost is that of residuals alone."""
+        if self.tilt is None:
+            return evaluation
+        more = self.tilt.cost(self.parameters, evaluation.parameters)
+        return replace(
+            evaluation, cost=evaluation.cost - more, own_cost=evaluation.own_cost - more
+        )
+
     def _whitened(
         self, motions: Sequence[Motion], parameters: dict[str, Array]
     ) -> tuple[list[Array], float]:
@@ -523,15 +536,14 @@ class Problem:
         ):
             measured = np.isfinite(sigma)
             logarithm = np.log(np.where(measured, sigma, 1.0))
-            robust = self.robust_weights.get(bound.observation.label)
-            if robust is not None:
-                error = self.residual(bound.observation, motion, evaluation.parameters)
-                wrong = robust == 0.0
-                cost = gross_errors(
-                    np.where(measured, error, np.nan), sigma, wrong, bound.observation.unit
-                )
+            o = bound.observation
+            left_out = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
+            wrong = (self.robust_weights.get(o.label, np.ones(1)) == 0.0) | left_out[:, None]
+            if wrong.any():
+                error = self.residual(o, motion, evaluation.parameters)
+                cost = gross_errors(np.where(measured, error, np.nan), sigma, wrong, o.unit)
                 logarithm = np.where(wrong & measured, cost - 0.5 * np.log(2.0 * np.pi), logarithm)
-            out.append(bound.usable * np.sum(logarithm, axis=1))
+            out.append((bound.usable | left_out) * np.sum(logarithm, axis=1))
         return out
 
     def _weights(self, evaluation: Evaluation) -> list[Array]:
@@ -674,8 +686,6 @@ class Problem:
         ValueError
             If measurements have not been weighed yet.
         """
-        from factorgraph_dvl.graph.native_graph import native_graph
-
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
         if self.chain.interpolates:

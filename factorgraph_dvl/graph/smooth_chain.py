@@ -10,6 +10,7 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import BodyAxes, log_so3
@@ -30,7 +31,6 @@ from factorgraph_dvl.graph.smooth_motion import (
 from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
-from factorgraph_dvl.solution import Trajectory
 
 # Source of noise of the prior of the motion.
 MOTION = "acceleration between states"
@@ -141,6 +141,11 @@ class SmoothChain:
     def duration(self) -> float:
         """How long the motion is known, s."""
         return float(self.node_time[-1] - self.node_time[0])
+
+    @property
+    def log_determinant(self) -> float:
+        """Log det of the covariance of the steps, but for what their length makes it."""
+        return 2.0 * float(np.log(self.density).sum())
 
     @property
     def middle(self) -> float:

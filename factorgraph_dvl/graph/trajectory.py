@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import concatenated, rows_of
 from factorgraph_dvl.geometry.rotations import (
@@ -28,7 +29,6 @@ from factorgraph_dvl.imu.propagation import (
     segment_ends,
 )
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.solution import Trajectory
 
 # Rate of trajectories, Hz, whatever the rate of the states. Chosen: resolves a vessel's motion.
 TRAJECTORY_RATE = 10.0

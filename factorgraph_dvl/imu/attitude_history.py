@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import RATE
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
@@ -17,7 +18,6 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import attach
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 # Time between the states that the gyros are integrated from, s. Chosen: that of the graph.

@@ -21,9 +21,9 @@ from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_st
 from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.sensors.message import message
 
 # Lost samples up to this number are interpolated; a longer gap ends the arc. Chosen: a polynomial
 # through six neighbours still follows the motion.

@@ -11,9 +11,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from factorgraph_dvl.geometry.units import DEG_PER_SQRT_HOUR, MICRO_G
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.message import message
 
 # Chosen: samples to a spectrum, and the window, whose side lobes are 180 dB down: sway of
 # 1 rad/s leaks less than the quietest gyro's noise into the bands.

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.trial import Trial
 
@@ -16,7 +16,7 @@ from factorgraph_dvl.trial import Trial
 JUMP = 3600.0
 
 
-def without_strays(trial: Trial) -> Trial:
+def without_restarted_clock(trial: Trial) -> Trial:
     """Return a trial without what its IMU recorded by another clock than all other sensors.
 
     A logger that starts at 0 and takes GPS time later stamps its first samples by a clock of

@@ -32,6 +32,8 @@ from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.initialization.attitude_sensors import attitude_at_start, known_mountings
 from factorgraph_dvl.initialization.dead_reckoned_spans import DeadReckonedSpan, arc_from_start
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import (
     BIAS,
     LEVER_ARM,
@@ -40,9 +42,7 @@ from factorgraph_dvl.sensors.dvl import (
     TIME_OFFSET,
     Dvl,
 )
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.trial import Trial
 
 # Velocity error, m/s, that a gyro bias may cause over a window through tilted gravity, and

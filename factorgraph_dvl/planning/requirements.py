@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.estimates import Estimate
 
 
 @dataclass(frozen=True)

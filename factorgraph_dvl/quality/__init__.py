@@ -1,1 +1,1 @@
-"""What is wrong with a trial, before and after it is solved."""
+"""What a result is worth: findings, grades and the verdict, and all their texts."""

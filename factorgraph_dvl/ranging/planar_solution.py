@@ -8,7 +8,23 @@ from functools import partial
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, SolveError
+from factorgraph_dvl.estimates import (
+    Estimate,
+    Hypothesis,
+    Residuals,
+    Trajectory,
+    as_estimates,
+    mixed,
+)
 from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import (
+    ambiguity,
+    consistency_findings,
+    mostly_rejected,
+    not_observable,
+)
 from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
 from factorgraph_dvl.ranging.marginal_posterior import grid_points, posterior_weights
 from factorgraph_dvl.ranging.model import EARTH_RADIUS, PlanarProblem
@@ -17,24 +33,9 @@ from factorgraph_dvl.ranging.problem import RangingSetup, planar_setup
 from factorgraph_dvl.ranging.smoother import Fit, covariance, residuals
 from factorgraph_dvl.sensors.beacon import SOUND_SPEED_ERROR, Beacons
 from factorgraph_dvl.sensors.depth import Depth
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
-from factorgraph_dvl.solution import (
-    Estimate,
-    Hypothesis,
-    Progress,
-    Residuals,
-    Solution,
-    Trajectory,
-    ambiguity,
-    as_estimates,
-    consistency_findings,
-    mixed,
-    mostly_rejected,
-    not_observable,
-)
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 # Chosen: number of times at which hypotheses are fitted and weighed.

@@ -13,12 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Hypothesis
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import mostly_rejected
 from factorgraph_dvl.ranging.hypotheses import TrackedHypothesis, follow
 from factorgraph_dvl.ranging.model import EARTH_RADIUS
 from factorgraph_dvl.ranging.planar_solution import measurements, reported_hypothesis, schedule
@@ -26,11 +30,8 @@ from factorgraph_dvl.ranging.planar_track import PlanarTrack
 from factorgraph_dvl.ranging.problem import RangingSetup, ranging_setup
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.speed_log import HEADING_BIAS_SPEC, LOG_SCALE_SPEC
-from factorgraph_dvl.solution import Hypothesis, mostly_rejected
 from factorgraph_dvl.trial import InitialPosition, Trial
 
 # Chosen: standard deviations of dead reckoning before anything is solved, wide of what alignment

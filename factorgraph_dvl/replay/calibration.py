@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate, as_estimates
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE
 from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Estimate, as_estimates
 from factorgraph_dvl.solvers.reported import in_order, in_unit
 
 

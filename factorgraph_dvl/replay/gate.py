@@ -12,9 +12,9 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.record import Innovations
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.

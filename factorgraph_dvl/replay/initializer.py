@@ -13,11 +13,11 @@ from factorgraph_dvl.errors import DataError, FactorgraphDvlError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.solution import Progress

@@ -10,6 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
@@ -34,16 +35,15 @@ from factorgraph_dvl.graph.trajectory import (
     trajectory_at,
 )
 from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
 from factorgraph_dvl.replay.gate import InnovationGate, gated
 from factorgraph_dvl.replay.record import Innovations
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
-from factorgraph_dvl.solution import Trajectory
 
 # Distance, m, over which gravity is taken as linear. Measured against the full model: the error
 # stays below 3e-9 m/s².

@@ -9,25 +9,19 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, SolveError
-from factorgraph_dvl.imu.timestamps import without_strays
-from factorgraph_dvl.quality.earlier_calibration import prior_findings
-from factorgraph_dvl.quality.refusal import accepted_errors, explained
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.imu.timestamps import without_restarted_clock
+from factorgraph_dvl.message import message
+from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
+from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import consistency_findings, not_observable
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord, Update
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import (
-    Calibration,
-    Progress,
-    Solution,
-    consistency_findings,
-    not_observable,
-)
+from factorgraph_dvl.solution import Calibration, Progress, Solution
 from factorgraph_dvl.trial import Trial
 
 # What holds only until something else is said.
@@ -135,7 +129,7 @@ def replay(
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
         solution, record = _played(
-            trial if trial.imu is None else without_strays(trial),
+            trial if trial.imu is None else without_restarted_clock(trial),
             smoother=smoother,
             lag_s=lag_s,
             rate_hz=rate_hz,

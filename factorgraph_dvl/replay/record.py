@@ -10,10 +10,10 @@ from math import prod
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Residuals, Trajectory
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solution import Residuals, Trajectory
 
 
 @dataclass(frozen=True)

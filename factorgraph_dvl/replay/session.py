@@ -13,8 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.arrivals import (
     AHEAD,
     SAME_TIME,
@@ -28,11 +31,9 @@ from factorgraph_dvl.replay.initializer import Initializer
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Noise, Progress, Trajectory
+from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.state_times import CLOSEST
 from factorgraph_dvl.trial import Trial
 

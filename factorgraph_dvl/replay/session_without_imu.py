@@ -10,6 +10,7 @@ from time import perf_counter
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
@@ -18,6 +19,8 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.arrivals import Outages
 from factorgraph_dvl.replay.calibration import CalibrationReport
 from factorgraph_dvl.replay.gate import InnovationGate, Judged, judged
@@ -30,11 +33,9 @@ from factorgraph_dvl.replay.window import (
     information_without,
     stepped,
 )
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Noise, Progress, Trajectory
+from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.preparation_without_imu import (
     LONGEST,
     TURN_SPAN,

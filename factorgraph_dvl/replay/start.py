@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
@@ -17,12 +18,12 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import AttitudeAid
-from factorgraph_dvl.solution import Noise, Progress, Trajectory
+from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.posterior import posterior

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
@@ -32,7 +33,6 @@ from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
-from factorgraph_dvl.solution import Noise, Trajectory
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.posterior import Posterior, posterior

@@ -6,8 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
-from factorgraph_dvl.baselines.nine_state_ukf import unscented
+from factorgraph_dvl.baselines.nine_state import nine_state, unscented, with_bias
 from factorgraph_dvl.baselines.outcome import Outcome, prior_of
 from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3

@@ -19,8 +19,8 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,

@@ -14,10 +14,10 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.dvl import CLOCK, LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,

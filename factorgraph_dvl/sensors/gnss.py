@@ -14,9 +14,9 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     USUAL_CORRELATION_TIME,

@@ -12,6 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.attitude import (
     LEAST_STD,
     SCHULER_PERIOD,
@@ -24,7 +25,6 @@ from factorgraph_dvl.sensors.attitude import (
 )
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,

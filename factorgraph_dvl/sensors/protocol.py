@@ -12,8 +12,7 @@ from msgspec import UNSET, UnsetType
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, IntArray, cross_variance
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.message import Message
+from factorgraph_dvl.message import Message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.settings.sections import Section
 
@@ -22,11 +21,6 @@ Values = Mapping[str, Array]
 # Whether the noise of a sensor is estimated from its residuals, or final as it is stated.
 NoiseModel = Literal["estimated", "stated"]
 
-# Factors by which residuals are larger than stated from which on every standard deviation is too
-# small, and the model another than the data's. Chosen: sums of some hundred residuals stay below
-# the first by chance, and no data sheet is wrong by the second.
-TOO_LARGE = 1.3
-DO_NOT_FIT = 10.0
 # Derivatives by the motion, as `Linearization` names them.
 _BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
 # Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
@@ -378,15 +372,12 @@ class Attitudes:
         Standard deviation about the axis that is known best.
     mounting : Parameter
         The parameter sRb, with its prior.
-    findings : tuple of Finding, optional
-        What the record says against itself, for people.
     """
 
     time: Array
     nRs: Array
     sigma: Array
     mounting: Parameter
-    findings: tuple[Finding, ...] = ()
 
 
 @runtime_checkable

@@ -12,8 +12,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import Motion, Observation, SensorSection
 from factorgraph_dvl.sensors.records import check_range, check_times

@@ -9,7 +9,6 @@ from typing import Annotated, ClassVar, Self
 import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtrc
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.celestial import (
@@ -21,11 +20,9 @@ from factorgraph_dvl.geometry.earth import LocalFrame, enu_from_ecef
 from factorgraph_dvl.geometry.rotations import BodyAxes, inverse_right_jacobian, log_so3
 from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    TOO_LARGE,
     Attitudes,
     Linearization,
     Motion,
@@ -55,10 +52,6 @@ _NORM = 1e-3
 # Vectors closer to one line than this, rad, are parallel. Chosen: they show the rotation about
 # themselves a thousand times less well than the other two.
 _PARALLEL = 1e-3
-# Probability of a misfit of stars below which it is no chance. Chosen: one trial in 10 000.
-_BY_CHANCE = 1e-4
-# Misfit of stars to their catalogue that no standard deviation stated too small explains: chosen.
-_WRONG_STARS = 3.0
 
 
 class StarSettings(SensorSection, frozen=True, kw_only=True):
@@ -257,7 +250,7 @@ class Star:
         eRi = earth_from_inertial(frame.epoch, time, self.settings.ut1_utc_s)
         best = np.linalg.eigvalsh(self.covariance[known])[:, 0]
         nRs = nRe @ eRi @ iRs
-        return Attitudes(time, nRs, np.sqrt(best), self.parameters()[0], self.findings())
+        return Attitudes(time, nRs, np.sqrt(best), self.parameters()[0])
 
     @property
     def misfit(self) -> float:
@@ -267,43 +260,14 @@ class Star:
         components across each direction, less three of each attitude. nan where the record
         holds attitudes.
         """
-        v = self._seen
+        v = self.vectors_of_epochs
         if v is None:
             return np.nan
         freedom = 2 * v.time.size - 3 * self.time.size
-        return float(np.sqrt(np.sum(self._star_misfits() ** 2) / freedom))
-
-    def findings(self) -> tuple[Finding, ...]:
-        """Return a finding if the stars do not fit their catalogue, naming the worst of them."""
-        v = self._seen
-        if v is None or not self.misfit > TOO_LARGE:
-            return ()
-        square = self._star_misfits() ** 2
-        freedom = 2 * v.time.size - 3 * self.time.size
-        if chdtrc(freedom, square.sum()) > _BY_CHANCE:
-            return ()
-        stars, row, which = np.unique(
-            np.round(v.inertial, 4), axis=0, return_index=True, return_inverse=True
-        )
-        each = np.bincount(which.ravel(), square) / np.bincount(which.ravel())
-        worst = int(np.argmax(each))
-        wrong = self.misfit > _WRONG_STARS
-        return (
-            Finding(
-                Code.STAR_CATALOGUE,
-                message(
-                    "star_catalogue.wrong" if wrong else "star_catalogue.differs",
-                    misfit=self.misfit,
-                    star=stars[worst],
-                    row=at_row(self.source, row[worst]),
-                ),
-                sensor=self.label,
-                severity="error" if wrong else "warning",
-            ),
-        )
+        return float(np.sqrt(np.sum(self.star_misfits() ** 2) / freedom))
 
     @property
-    def _seen(self) -> StarVectors | None:
+    def vectors_of_epochs(self) -> StarVectors | None:
         """Vectors of the record's epochs; None where they are not those of every epoch.
 
         Some rows of a record keep all vectors, and joined ones those of the first.
@@ -315,9 +279,9 @@ class Star:
         v = StarVectors(v.time[rows], v.body[rows], v.inertial[rows])
         return v if np.array_equal(v.time[v.first], self.time) else None
 
-    def _star_misfits(self) -> Array:
+    def star_misfits(self) -> Array:
         """Return the angles from the catalogue's directions to the measured ones, (K,), sigmas."""
-        v = self._seen
+        v = self.vectors_of_epochs
         assert v is not None
         count = np.diff(np.append(v.first, v.time.size))
         iRs = Rotation.from_quat(np.repeat(self.quaternion[:, [1, 2, 3, 0]], count, axis=0))

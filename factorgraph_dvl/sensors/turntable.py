@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.message import Message
+from factorgraph_dvl.message import Message
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import Motion, Observation, SensorSection
 from factorgraph_dvl.sensors.records import check_finite, check_range, check_times

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,16 +12,13 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
-from factorgraph_dvl.simulation.instruments import DvlBeamsTruth, TurntableTruth
+from factorgraph_dvl.simulation.instruments import DvlBeamsTruth, ScenarioView, TurntableTruth
 from factorgraph_dvl.simulation.measurements import apply, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
 
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
-
 
 def simulate_beams(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[DvlBeams, dict[str, Array]]:
     """Return the record of the beams, and their calibration by reported name.
 
@@ -57,7 +54,7 @@ def simulate_beams(
 
 
 def simulate_turntable(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Turntable, dict[str, Array]]:
     """Return the record of the turntable, its angle without error."""
     truth: TurntableTruth = scenario.turntable

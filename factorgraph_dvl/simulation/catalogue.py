@@ -25,8 +25,14 @@ from factorgraph_dvl.simulation.instruments import (
     TurntableTruth,
 )
 from factorgraph_dvl.simulation.measurements import simulate_dvl, simulate_gnss, simulate_imu
-from factorgraph_dvl.simulation.ranging import simulate_beacons, simulate_heading, simulate_log
-from factorgraph_dvl.simulation.ranging_instruments import BeaconTruth, HeadingTruth, LogTruth
+from factorgraph_dvl.simulation.ranging import (
+    BeaconTruth,
+    HeadingTruth,
+    LogTruth,
+    simulate_beacons,
+    simulate_heading,
+    simulate_log,
+)
 from factorgraph_dvl.simulation.star import simulate_star
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 
@@ -12,12 +12,9 @@ from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
 from factorgraph_dvl.sensors.ins import Ins, InsSettings
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3
-from factorgraph_dvl.simulation.instruments import SimulatedInstrument
+from factorgraph_dvl.simulation.instruments import ScenarioView, SimulatedInstrument
 from factorgraph_dvl.simulation.measurements import displaced, sample_times
 from factorgraph_dvl.simulation.motion import TrueMotion
-
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
 
 # Period of an undamped gyrocompass and of an INS, s: 84.4 minutes.
 _SCHULER_S = 5064.0
@@ -80,7 +77,7 @@ class InsTruth(SimulatedInstrument, frozen=True, kw_only=True):
 
 
 def simulate_attitude(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Attitude, dict[str, Array]]:
     """Return the record of the compass, and its offsets by reported name."""
     truth: AttitudeTruth = scenario.attitude
@@ -108,7 +105,7 @@ def simulate_attitude(
 
 
 def simulate_ins(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Ins, dict[str, Array]]:
     """Return the record of the INS, and its time offset."""
     truth: InsTruth = scenario.ins

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
-from factorgraph_dvl.simulation.instruments import DepthTruth
+from factorgraph_dvl.simulation.instruments import DepthTruth, ScenarioView
 from factorgraph_dvl.simulation.measurements import displaced, sample_times
 from factorgraph_dvl.simulation.motion import TrueMotion
 
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
-
 
 def simulate_depth(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Depth, dict[str, Array]]:
     """Return the sensor's record, and the height of the sea surface by reported name.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.depth import DepthSettings
 from factorgraph_dvl.sensors.dvl import DvlSettings
 from factorgraph_dvl.sensors.dvl_beams import DvlBeamsSettings
@@ -25,6 +26,31 @@ Draw = Literal["draw"]
 # Elements of a matrix by rows: off the diagonal, and all.
 _OffDiagonal = tuple[float, float, float, float, float, float]
 _Matrix = tuple[Vector3, Vector3, Vector3]
+
+
+class ScenarioView(Protocol):
+    """What the motion and the instruments read of a scenario; sections by their names."""
+
+    @property
+    def body_axes(self) -> BodyAxes:
+        """Axes of the body quantities."""
+
+    @property
+    def noise(self) -> bool:
+        """Whether there is noise."""
+
+    @property
+    def current_m_s(self) -> Vector3:
+        """Current east, north, up, m/s."""
+
+    @property
+    def source(self) -> str:
+        """Name of the file, for messages."""
+
+    def settings(self, section: str) -> SensorSection:
+        """Return a sensor's section of the trial."""
+
+    def __getattr__(self, section: str) -> Any: ...
 
 
 class Sampled(Section, frozen=True, kw_only=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pymap3d
@@ -18,18 +18,21 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, Interval, Sampled
+from factorgraph_dvl.simulation.instruments import (
+    DvlTruth,
+    GnssTruth,
+    Interval,
+    Sampled,
+    ScenarioView,
+)
 from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
-
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
 
 # Chosen: samples computed at a time; limits memory to some megabytes.
 _CHUNK = 32768
 
 
 def simulate_imu(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Imu, dict[str, Array]]:
     """Return the IMU's record, and its biases by reported name.
 
@@ -96,7 +99,7 @@ def simulate_imu(
 
 
 def simulate_gnss(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Gnss, dict[str, Array]]:
     """Return the receiver's record, position and velocity of the antenna, and its truth.
 
@@ -135,7 +138,7 @@ def simulate_gnss(
 
 
 def simulate_dvl(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Dvl, dict[str, Array]]:
     """Return the DVL's record, and its calibration by reported name.
 
@@ -175,7 +178,9 @@ def simulate_dvl(
     return dvl, calibration
 
 
-def _water(scenario: Scenario, time: Array, state: TrueState, rng: np.random.Generator) -> Array:
+def _water(
+    scenario: ScenarioView, time: Array, state: TrueState, rng: np.random.Generator
+) -> Array:
     """Return the velocity of what the DVL is locked on, (M, 3), m/s."""
     truth: DvlTruth = scenario.dvl
     water = np.zeros((time.size, 3))
@@ -237,7 +242,7 @@ def moving_water(
     return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
 
 
-def _dvl_velocity(scenario: Scenario, state: TrueState, current: Array) -> Array:
+def _dvl_velocity(scenario: ScenarioView, state: TrueState, current: Array) -> Array:
     truth: DvlTruth = scenario.dvl
     bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
     at_imu = apply(bRn, state.v_n - current)

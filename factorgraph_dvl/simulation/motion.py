@@ -7,9 +7,10 @@ integrated, by collocation to the last digits of a double.
 
 from __future__ import annotations
 
+import os
+import resource
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.interpolate import PPoly
@@ -26,12 +27,92 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.simulation.instruments import ScenarioView
 from factorgraph_dvl.simulation.manoeuvres import Accelerate, Climb, Manoeuvre, Stop, Straight
-from factorgraph_dvl.simulation.size import check_size
-from factorgraph_dvl.simulation.table import table_angle
 
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
+
+def table_angle(scenario: ScenarioView, duration: float) -> PPoly | None:
+    """Return the angle of the turntable over time, rad; None without one.
+
+    Raises
+    ------
+    ConfigError
+        If a turn ends after the manoeuvres.
+    """
+    if scenario.turntable is None:
+        return None
+    breaks, rates, slopes = [0.0], [], []
+
+    def add(until: float, rate: float, slope: float) -> None:
+        if until > breaks[-1]:
+            breaks.append(until)
+            rates.append(rate)
+            slopes.append(slope)
+
+    for i, turn in enumerate(scenario.turntable.turns):
+        end = turn.at_s + turn.duration_s
+        if end > duration:
+            raise ConfigError(
+                f"the turn ends at {end:g} s, after the manoeuvres, which take {duration:g} s",
+                where=f"{scenario.source} key turntable.turns[{i}]",
+                expected="an earlier turn, or longer manoeuvres",
+            )
+        rate = turn.turn_deg * DEG / (turn.duration_s - turn.ramp_s)
+        slope = rate / turn.ramp_s if turn.ramp_s > 0.0 else 0.0
+        add(turn.at_s, 0.0, 0.0)
+        add(turn.at_s + turn.ramp_s, 0.0, slope)
+        add(end - turn.ramp_s, rate, 0.0)
+        add(end, rate, -slope)
+    add(duration, 0.0, 0.0)
+    angle = PPoly(np.array([slopes, rates]), np.array(breaks)).antiderivative()
+    angle.c[-1] += scenario.turntable.start_deg * DEG
+    return angle
+
+
+# Measured: growth of the peak by simulating a million rows of the IMU, of GNSS, DVL or the
+# reference, and by integrating a million steps of the motion.
+_BYTES_PER_SAMPLE = 200
+_BYTES_PER_ROW = 600
+_BYTES_PER_STEP = 820
+
+
+def check_size(scenario: ScenarioView, duration: float, steps: float) -> None:
+    """Raise ConfigError if motion and records of a scenario cannot be in memory.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        With the rates of its sensors.
+    duration : float
+        Of its motion, s.
+    steps : float
+        Of the integration of its motion.
+    """
+    rows = {f"{name}.rate_hz": s.rate_hz * duration for name, s in scenario.aids.items()}
+    rows["reference_rate_hz"] = scenario.reference_rate_hz * duration
+    needs = {key: count * _BYTES_PER_ROW for key, count in rows.items()}
+    if scenario.imu is not None:
+        rows["imu.rate_hz"] = scenario.imu.rate_hz * duration
+        needs["imu.rate_hz"] = rows["imu.rate_hz"] * _BYTES_PER_SAMPLE
+    motion = "sway" if steps > 2.0 * duration else "manoeuvres"
+    rows[motion], needs[motion] = steps, steps * _BYTES_PER_STEP
+    have = _memory()
+    if sum(needs.values()) > have:
+        key = max(needs, key=lambda k: needs[k])
+        raise ConfigError(
+            f"{duration:.6g} s of it are {rows[key]:.3g} steps; the trial needs about "
+            f"{sum(needs.values()) / 1e9:.3g} GB of memory, and there are {have / 1e9:.3g} GB",
+            where=f"{scenario.source} key {key}",
+            expected="a lower rate or frequency, or shorter manoeuvres",
+        )
+
+
+def _memory() -> float:
+    """Return the memory that a process can have, bytes."""
+    installed = float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    return installed if limit == resource.RLIM_INFINITY else min(installed, float(limit))
+
 
 # Chosen: reaches the precision of a double with steps of half a second.
 _COLLOCATION_NODES = 6
@@ -280,7 +361,7 @@ class _LevelToBody:
         )
 
 
-def plan_motion(scenario: Scenario) -> TrueMotion:
+def plan_motion(scenario: ScenarioView) -> TrueMotion:
     """Return the motion of a scenario.
 
     Raises

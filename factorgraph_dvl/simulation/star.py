@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import erfa
 import numpy as np
@@ -15,16 +15,13 @@ from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import ARCSEC, DAY, DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.star import Star, StarSettings
-from factorgraph_dvl.simulation.instruments import StarTruth
+from factorgraph_dvl.simulation.instruments import ScenarioView, StarTruth
 from factorgraph_dvl.simulation.measurements import sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion, TrueState
 
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
-
 
 def simulate_star(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Star, dict[str, Array]]:
     """Return the tracker's record, quaternions or star vectors, and its mounting.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 from zlib import crc32
 
 import numpy as np
@@ -12,18 +11,15 @@ from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, PPM, STANDARD_GRAV
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.simulation import faults
 from factorgraph_dvl.simulation.faults import Fault
-from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth
+from factorgraph_dvl.simulation.instruments import DvlTruth, GnssTruth, ImuTruth, ScenarioView
 from factorgraph_dvl.trial import Trial
-
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
 
 _PER_G = DEG_PER_HOUR / STANDARD_GRAVITY
 _OFF_DIAGONAL = ~np.eye(3, dtype=bool)
 _BELOW_DIAGONAL = np.tri(3, k=-1, dtype=bool)
 
 
-def with_stated_errors(trial: Trial, scenario: Scenario, seed: int) -> Trial:
+def with_stated_errors(trial: Trial, scenario: ScenarioView, seed: int) -> Trial:
     """Return a simulated trial with the errors that its scenario states.
 
     Parameters
@@ -44,7 +40,7 @@ def with_stated_errors(trial: Trial, scenario: Scenario, seed: int) -> Trial:
     return replace(trial, calibration_truth=trial.calibration_truth | truth)
 
 
-def _stated(scenario: Scenario, seed: int) -> dict[str, Fault]:
+def _stated(scenario: ScenarioView, seed: int) -> dict[str, Fault]:
     """Return the errors of a scenario by name, in the order in which they are added."""
     out: dict[str, Fault] = {}
     if scenario.gnss is not None:
@@ -114,7 +110,7 @@ def _varying_dvl(truth: DvlTruth) -> dict[str, Fault]:
     return out
 
 
-def _imu_errors(scenario: Scenario, seed: int) -> dict[str, Fault]:
+def _imu_errors(scenario: ScenarioView, seed: int) -> dict[str, Fault]:
     elements = {name: _value(scenario, "imu", name, seed) for name in ImuTruth.matrices}
     if not any(value.any() for value in elements.values()):
         return {}
@@ -139,7 +135,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 }
 
 
-def _value(scenario: Scenario, section: str, name: str, seed: int) -> Array:
+def _value(scenario: ScenarioView, section: str, name: str, seed: int) -> Array:
     """Return the value of a constant error, drawn if the scenario says so."""
     truth = getattr(scenario, section)
     value = getattr(truth, name)

@@ -12,12 +12,12 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.quality.refusal import accepted_errors, explained
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.solution import Progress, Solution, ambiguity, joined, most_probable_minimum
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.fixed_directions import (
     SolvedProblem,
     undetermined_there,
@@ -29,6 +29,8 @@ from factorgraph_dvl.solvers.minima import (
     cost_terms,
     distinct,
     evidence_against,
+    joined,
+    most_probable_minimum,
 )
 from factorgraph_dvl.solvers.preparation import Prepared, prepare
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
@@ -246,6 +248,7 @@ def _with_covariances(
     findings = (*findings, *settled.findings)
     free = copy(problem)
     solved = with_covariances(problem, before, minimise_again, findings=findings)
+    solved = replace(solved, steps=settled.steps)
     if before.converged or not solved.minimum.converged:
         return solved
     converged = settled.settled and undetermined_there(solved, free)

@@ -12,9 +12,9 @@ from scipy.special import chdtrc
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import IMU_NOISE, WALK
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation

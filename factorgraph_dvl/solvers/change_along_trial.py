@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem

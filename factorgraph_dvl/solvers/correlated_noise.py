@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Noise, noise_name
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process, node_times, walk_sigma, walk_time
 from factorgraph_dvl.sensors.protocol import Observation, ScaleWalk
-from factorgraph_dvl.solution import Noise, noise_name
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.statistics.correlation import Correlation, fit_correlation
 from factorgraph_dvl.statistics.leverage import leverage
@@ -56,12 +56,15 @@ class CorrelatedNoise:
         By label, factors (d,) on standard deviations for noise that persists for seconds.
     gain : float
         Fall of -2 log likelihood by what is not stated, against white noise alone.
+    long_run_gain : float
+        The part of it by noise that persists for seconds.
     """
 
     processes: tuple[Process, ...]
     factors: dict[str, Array]
     long_run: dict[str, Array]
     gain: float
+    long_run_gain: float
 
 
 def correlated_noise(
@@ -81,7 +84,7 @@ def correlated_noise(
     processes: list[Process] = []
     factors: dict[str, Array] = {}
     long_run: dict[str, Array] = {}
-    gain = 0.0
+    gain = long_run_gain = 0.0
     for i, o in enumerate(problem.observations):
         weight = problem.weights[i]
         used = weight > 0.0
@@ -101,8 +104,8 @@ def correlated_noise(
         elif o.label in estimated and np.ptp(when) >= _SHORTEST:
             residuals = np.where(used, evaluation.residuals[i], np.nan)
             found = _fits(o, residuals)
-            as_stated = sigma / problem.noise_factors.get(o.label, 1.0)
-            missing = _unseen(o, residuals * sigma / as_stated, found, when)
+            factor = problem.noise_factors.get(o.label, 1.0)
+            share = _unseen(o, residuals * factor, found, when)
             if found:
                 if any(fit.time_s < _SHORT for fit in found.values()):
                     followed = _followed_time(problem, evaluation, i)
@@ -113,15 +116,19 @@ def correlated_noise(
                 gain += sum(fit.gain for fit in found.values())
                 if (inflation != 1.0).any():
                     long_run[o.label] = inflation
-            if missing.any():
-                process = _with_unseen(
-                    process, o, missing * as_stated, sigma, when, len(processes)
-                )
+                    long_run_gain += sum(f.gain for f in found.values() if f.time_s < _SHORT)
+            if share.any():
+                missing = share * sigma / factor
+                process = _with_unseen(process, o, missing, sigma, when, len(processes))
+                # White and persisting noise together are what is stated.
+                white = factors.get(o.label, np.ones(sigma.size) * factor)
+                shown = np.maximum(np.sqrt(1.0 - share**2), LEAST_FACTOR)
+                factors[o.label] = np.where(share > 0.0, shown, white)
         if o.scale_walk is not None and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None:
             processes.append(process)
-    return CorrelatedNoise(tuple(processes), factors, long_run, gain)
+    return CorrelatedNoise(tuple(processes), factors, long_run, gain, long_run_gain)
 
 
 def _unseen(
@@ -150,9 +157,10 @@ def _unseen(
     if o.correlated is None or np.ptp(time) > _MANY * o.correlated.time:
         return missing
     for group in set(o.noise_groups).difference(found):
-        square = residuals[:, list(group)] ** 2
-        lack, count = 1.0 - float(np.nanmean(square)), np.count_nonzero(np.isfinite(square))
-        if lack > _SURE * np.sqrt(2.0 / count):
+        own = residuals[:, list(group)]
+        count = np.count_nonzero(np.isfinite(own))
+        lack = 1.0 - float(np.nansum(own**2)) / max(count, 1)
+        if count and lack > _SURE * np.sqrt(2.0 / count):
             missing[list(group)] = np.sqrt(lack)
     return missing
 
@@ -275,6 +283,14 @@ def _model(
     )
     process = Process(o.label, index, process_sigma, tau, nodes, density_only)
     return process, white, inflation
+
+
+def with_others(before: Sequence[Process], found: Sequence[Process]) -> tuple[Process, ...]:
+    """Return processes as they were, with others that were found."""
+    known = {p.label for p in before}
+    free = (i for i in range(len(before) + len(found)) if i not in {p.index for p in before})
+    others = (p for p in found if p.label not in known)
+    return (*before, *(replace(p, index=i) for p, i in zip(others, free, strict=False)))
 
 
 def with_innovations(process: Process, factor: Array) -> Process:

@@ -10,7 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.solution import SolverStep
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -42,6 +43,8 @@ class SolvedProblem:
         What the user must know.
     spurious : ndarray, shape (K, P, P), optional
         Spurious information by node there, if it is known already.
+    steps : tuple of SolverStep, optional
+        What the solver changed of its assumptions.
     """
 
     problem: Problem
@@ -50,6 +53,7 @@ class SolvedProblem:
     fixed: Array
     findings: tuple[Finding, ...] = ()
     spurious: Array | None = None
+    steps: tuple[SolverStep, ...] = ()
 
 
 def with_covariances(

@@ -11,10 +11,10 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, Attitude, heading_error
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.reported import in_unit
 from factorgraph_dvl.trial import Trial

@@ -13,11 +13,11 @@ from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
-from factorgraph_dvl.quality.earlier_calibration import prior_against_data
-from factorgraph_dvl.quality.sensor_clocks import LEAP_SECONDS
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
+from factorgraph_dvl.plausibility.earlier_calibration import prior_against_data
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
-from factorgraph_dvl.sensors.message import Message, message
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.sensors.protocol import ObservationByRows
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes

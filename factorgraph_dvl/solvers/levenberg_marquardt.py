@@ -78,6 +78,7 @@ def minimise(
     proven: bool = True,
     enough: float = 0.0,
     binding: bool = False,
+    weighed: bool = False,
 ) -> Minimum:
     """Minimise a problem's cost.
 
@@ -109,13 +110,18 @@ def minimise(
         Mean square of a whitened residual below which no minimum is needed.
     binding : bool, default False
         Whether to stop near a minimum at which measurements are to be bound anew.
+    weighed : bool, default False
+        Whether measurements keep the weights that they have; by default, they are weighed at the
+        start.
 
     Raises
     ------
     SolveError
         If the cost at the start is not finite.
     """
-    evaluation = problem.weighed(problem.evaluate(values))
+    evaluation = problem.evaluate(values)
+    if not weighed:
+        evaluation = problem.weighed(evaluation)
     if not np.isfinite(evaluation.cost):
         raise SolveError(
             "the cost at the start is not finite",

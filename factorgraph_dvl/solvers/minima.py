@@ -8,13 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.estimates import OBSERVABLE, Hypothesis, mixed
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import ROUGH_TOLERANCE, Preparation, Prepared
@@ -36,6 +40,8 @@ _START_ITERATIONS = 15
 # separates the headings.
 _ROUGHLY_AS_GOOD = 30.0
 _SAME_ANGLE = 15.0 * DEG
+# Evidence against a minimum with which it is not worth a word. Chosen: a probability of e^-15.
+_IMPOSSIBLE = 15.0
 
 
 def competing_minima(prepared: Prepared, states: Any, report: Progress) -> list[SettledMinimum]:
@@ -175,15 +181,99 @@ def cost_terms(found: SolvedProblem) -> Array:
     problem, evaluation = found.problem, found.minimum.evaluation
     parts = []
     total = 0.0
-    for observation, residual, usable, log_sigma in zip(
-        problem.observations,
-        evaluation.residuals,
-        problem.usable.values(),
-        problem.log_sigma(evaluation),
-        strict=True,
+    for residual, log_sigma in zip(
+        evaluation.residuals, problem.log_sigma(evaluation), strict=True
     ):
         own = 0.5 * np.sum(residual**2, axis=1)
         total += own.sum()
-        gate = observation.gate or 0.0
-        parts.append(np.where(usable, own, 0.5 * gate**2) + log_sigma)
+        parts.append(own + log_sigma)
     return np.concatenate([*parts, [evaluation.cost - total]])
+
+
+def joined(
+    solutions: Sequence[Solution], against: Array, hypotheses: Sequence[Hypothesis]
+) -> Solution:
+    """Return the most likely of some solutions, with what is known of the others.
+
+    Parameters
+    ----------
+    solutions : sequence of Solution
+        Of the living hypotheses.
+    against : ndarray, shape (S,)
+        Negative logarithms of their likelihoods, relative to the best.
+    hypotheses : sequence of Hypothesis
+        What the search for a start found: the living, in the order of `solutions`, then the dead.
+        Empty if there was no search.
+    """
+    if len(solutions) == 1 and len(hypotheses) < 2:
+        return solutions[0]
+    weights = np.exp(-against) / np.exp(-against).sum()
+    order = np.argsort(-weights)
+    living = [
+        replace(hypotheses[i], weight=float(weights[i]), trajectory=solutions[i].trajectory)
+        for i in order
+    ]
+    every = (*living, *hypotheses[len(solutions) :])
+    best = solutions[order[0]]
+    return replace(
+        best,
+        converged=all(s.converged for s in solutions),
+        trajectory=mixed([solutions[i].trajectory for i in order], weights[order]),
+        hypotheses=every,
+        findings=(*best.findings, *ambiguity(every)),
+    )
+
+
+def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solution:
+    """Return the most probable of some minima of one problem, with the spread of the others.
+
+    Parameters
+    ----------
+    solutions : sequence of Solution
+        At the minima, with the same estimates and epochs.
+    against : ndarray, shape (S,)
+        Negative logarithms of their probabilities.
+    """
+    order = [i for i in np.argsort(against) if against[i] - against.min() < _IMPOSSIBLE]
+    best = solutions[order[0]]
+    if len(order) == 1:
+        return best
+    weights = np.exp(against.min() - against[order])
+    weights /= weights.sum()
+    values = [np.concatenate([e.value for e in solutions[i].estimates]) for i in order]
+    covariance = np.zeros_like(best.covariance)
+    for i, weight, value in zip(order, weights, values, strict=True):
+        deviation = value - values[0]
+        covariance += weight * (solutions[i].covariance + np.outer(deviation, deviation))
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    estimates, at = [], 0
+    for k, e in enumerate(best.estimates):
+        own = std[at : at + e.std.size]
+        at += e.std.size
+        seen = np.all([solutions[i].estimates[k].observable for i in order], axis=0)
+        seen &= own <= OBSERVABLE * e.prior_std
+        estimates.append(replace(e, std=own, observable=seen))
+    turned = [
+        message("words.at", name=e.name, value=str(np.round(e.value, 1).tolist()))
+        for i in order[1:]
+        for e in solutions[i].estimates
+        if e.spec.kind == "rotation"
+    ]
+    return replace(
+        best,
+        converged=all(solutions[i].converged for i in order),
+        # That of one minimum does not explain the spread of all.
+        error_budget=(),
+        estimates=tuple(estimates),
+        covariance=covariance,
+        trajectory=mixed([solutions[i].trajectory for i in order], weights),
+        findings=(
+            *best.findings,
+            Finding(
+                Code.AMBIGUOUS,
+                message(
+                    "ambiguous.minima", count=len(order), weights=weights, others=tuple(turned)
+                ),
+            ),
+        ),
+    )

@@ -14,7 +14,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
 from factorgraph_dvl.statistics.variance_components import (
     VarianceComponents,
@@ -97,7 +97,8 @@ def motion_strengths(
     evaluation = problem.weighed(minimum.evaluation)
     # Nothing holds the constants in what follows.
     problem.tilt = None
-    information, step = factorized(problem, evaluation)
+    information = minimum.information
+    step = information.solution()
     found = variance_components(problem, evaluation, information)
     wanted = _wanted(problem, found, phase)
     steps = {

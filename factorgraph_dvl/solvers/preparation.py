@@ -18,12 +18,12 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.noise import with_recorded_noise
 from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States
-from factorgraph_dvl.imu.timestamps import without_strays
-from factorgraph_dvl.initialization.attitude_sensors import attitudes
+from factorgraph_dvl.imu.timestamps import without_restarted_clock
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
-from factorgraph_dvl.sensors.finding import Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -177,10 +177,10 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         If the records do not determine where and how the trial starts.
     """
     # What the result is compared with has no part in it.
-    trial = replace(without_strays(trial), reference=None, calibration_truth={})
-    louder: tuple[Finding, ...] = ()
+    trial = replace(without_restarted_clock(trial), reference=None, calibration_truth={})
+    noise_findings: tuple[Finding, ...] = ()
     if trial.estimates_noise(trial.inertial):
-        imu, louder = with_recorded_noise(trial.inertial)
+        imu, noise_findings = with_recorded_noise(trial.inertial)
         trial = replace(trial, imu=imu)
     frame = trial.frame()
     report("increments", 0, None)
@@ -192,7 +192,6 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     if trial.beacons is not None:
         report("ranges", 0, None)
     start_positions = positions_from_ranges(on_one_clock, frame, seg, start.states)
-    seen = [finding for each in attitudes(trial, frame) for finding in each.findings]
     by_aid = [(aid, *observed([aid], frame, trial.body_axes)) for aid in trial.aids]
     return Preparation(
         trial=trial,
@@ -213,10 +212,10 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         mountings=start.mountings,
         findings=(
             *trial.notes,
-            *louder,
+            *noise_findings,
             *gaps,
             *start.findings,
-            *seen,
+            *star_catalogue_findings(trial.aids),
             *start_positions.findings,
         ),
     )

@@ -23,11 +23,11 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.ins import Ins
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
 from factorgraph_dvl.sensors.records import rows_of

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate, as_estimates
 from factorgraph_dvl.geometry.rotations import (
     inverse_right_jacobian,
     reported_rotation_vector,
@@ -15,7 +16,6 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solution import Estimate, as_estimates
 
 _Row = TypeVar("_Row")
 

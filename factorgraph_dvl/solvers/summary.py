@@ -7,27 +7,25 @@ from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.quality.earlier_calibration import prior_findings
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import Message, message
-from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.solution import (
-    Estimate,
-    Residuals,
-    Solution,
-    Trajectory,
+from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import (
     consistency_findings,
     mostly_rejected,
     not_observable,
     outlier_findings,
 )
+from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.calibration import calibration
-from factorgraph_dvl.solvers.causes import causes
 from factorgraph_dvl.solvers.change_along_trial import change_findings
 from factorgraph_dvl.solvers.correlated_noise import noise_of
+from factorgraph_dvl.solvers.error_budget import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
@@ -90,6 +88,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         limits=trial.limits,
         noise=noise,
         error_budget=error_budget,
+        steps=found.steps,
     )
 
 

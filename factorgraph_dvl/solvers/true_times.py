@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, rotate
@@ -13,7 +14,6 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.solvers.posterior import Posterior
 
 # Epochs whose covariances are computed at once. Chosen: some ten megabytes.

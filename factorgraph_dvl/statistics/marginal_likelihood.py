@@ -21,8 +21,9 @@ hold everything. Where residuals are linear in x about the evaluation,
 
    \min_x |r|^2 = |r|^2 - |d|^2, \qquad \log\det\Lambda_{xx} = 2 \sum \log |R_{ii}|.
 
-The restricted likelihood, by which noise is estimated, integrates the constants too: it has
-|d|² and log det R of all conditionals, the constants' Schur complement included.
+The restricted likelihood, by which noise is estimated, integrates the constants too, about the
+most probable ones: it has log det R of all conditionals, the constants' Schur complement included.
+(|d|² of all would be that of the joint minimum, where log det R has another value.)
 
 **Gradient.** With P the covariance of the states given the constants,
 
@@ -60,6 +61,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.statistics.rows import with_own_covariance
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.variance_components import log_prior
 
 # Step of a difference, in standard deviations of the parameter, and at most, SI. Chosen: what
 # the rows are not linear in is then below 1e-5 of the change, and rounding below 1e-6 in the
@@ -75,11 +77,10 @@ def marginal_objective(
 
     At the constants of the evaluation and the best states near it. It has the squares of all
     residuals, those of priors included, log det of the states' information given the constants,
-    and log det of the covariances of measurements and of their correlated errors. Left out are
-    what no state, constant or noise factor of a measurement changes: n log 2 pi, and log det of
-    the noise of the IMU, of walks of its biases, of a motion's prior and of the priors of
-    constants. Densities of these are compared with their log det added. A rejected measurement
-    has the cost of a gross error in place of its log sigma.
+    and log det of the covariances of measurements, of their correlated errors, of walks, of a
+    motion's prior and of the priors of constants. Left out are n log 2 pi, and log det of what
+    no model changes, as the noise of the IMU. A rejected measurement has the cost of a gross
+    error in place of its log sigma.
 
     Parameters
     ----------
@@ -90,7 +91,8 @@ def marginal_objective(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    return _objective(problem, evaluation, information.given(_constants(problem)))
+    given = information.given(constants_of(problem))
+    return _objective(problem, evaluation, given.decrease, given.log_determinant)
 
 
 def restricted_objective(
@@ -98,19 +100,60 @@ def restricted_objective(
 ) -> float:
     """Return -2 log of the likelihood of the noise, with states and constants integrated out.
 
-    At the best states and constants near the evaluation; arguments, and what is left out, as in
-    `marginal_objective`.
+    By Laplace's approximation at the constants of the evaluation, which are to be the most
+    probable ones: `marginal_objective`, and log det of the constants' Schur complement. Arguments,
+    and what is left out, are the same.
     """
-    return _objective(problem, evaluation, information)
+    decrease = information.given(constants_of(problem)).decrease
+    return _objective(problem, evaluation, decrease, information.log_determinant)
 
 
 def _objective(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem, evaluation: Evaluation, decrease: float, log_determinant: float
 ) -> float:
+    """Return the terms of an objective.
+
+    Parameters
+    ----------
+    problem : Problem
+        With weights.
+    evaluation : Evaluation
+        Where the graph is linear.
+    decrease : float
+        What the best states take off the cost.
+    log_determinant : float
+        Log det of the information of what is integrated out.
+    """
     log_sigma = sum(float(each.sum()) for each in problem.log_sigma(evaluation))
     correlated = sum(process.log_determinant for process in problem.processes)
-    least = evaluation.cost - information.decrease
-    return 2.0 * (least + log_sigma) + information.log_determinant + correlated
+    _, prior = np.linalg.slogdet(problem.prior_root)
+    least = evaluation.cost - decrease
+    return float(
+        2.0 * (least + log_sigma + prior)
+        + log_determinant
+        + correlated
+        + problem.chain.log_determinant
+        + log_prior(problem.noise_factors, problem.observations)
+        + _persisting(problem, evaluation)
+    )
+
+
+def _persisting(problem: Problem, evaluation: Evaluation) -> float:
+    """Return what noise that persists for some measurements adds to -2 log of the likelihood.
+
+    In place of wide white noise, which their weights have, it is that of white noise less the
+    gain of their correlation.
+    """
+    out = -problem.gain
+    for o, weight, residual in zip(
+        problem.observations, problem.weights, evaluation.residuals, strict=True
+    ):
+        factor = problem.long_run.get(o.label)
+        if factor is not None:
+            used = (weight > 0.0).sum(axis=0)
+            squares = np.sum(residual**2, axis=0)
+            out += float(np.sum(squares * (factor**2 - 1.0) - 2.0 * used * np.log(factor)))
+    return out
 
 
 def log_determinant_gradient(
@@ -131,7 +174,7 @@ def log_determinant_gradient(
     information : SquareRootInformation
         From the elimination there, the constants last.
     """
-    constants = _constants(problem)
+    constants = constants_of(problem)
     out = np.zeros(len(problem.prior_root))
     if not constants:
         return out
@@ -159,7 +202,7 @@ def log_determinant_gradient(
     return out
 
 
-def _constants(problem: Problem) -> set[int]:
+def constants_of(problem: Problem) -> set[int]:
     """Return the keys of the constants."""
     return {problem.key(p.name) for p in problem.parameters}
 

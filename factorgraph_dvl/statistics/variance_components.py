@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.statistics.leverage import exact_leverage, leverage
 from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -69,6 +71,25 @@ class VarianceComponents:
     white: dict[str, NoiseFactor]
     correlated: dict[str, NoiseFactor]
     steps: tuple[Array, Array] | None = None
+
+
+def log_prior(noise_factors: Mapping[str, Array], observations: Iterable[Observation]) -> float:
+    """Return -2 log of the prior of factors on stated noise: nu (1/f² + log f²) of each group.
+
+    Parameters
+    ----------
+    noise_factors : mapping of str to ndarray
+        By label, factors (d,).
+    observations : iterable of Observation
+        Their components share factors in groups.
+    """
+    square = [
+        float(noise_factors[o.label][group[0]]) ** 2
+        for o in observations
+        if o.label in noise_factors
+        for group in o.noise_groups
+    ]
+    return _PRIOR_FREEDOM * sum(1.0 / f + float(np.log(f)) for f in square)
 
 
 def variance_components(

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.analysis.beam_angles import beam_angles
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.sensors.dvl_beams import DvlBeamsSettings
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.solution import Calibration
 
 ALPHA_THETA = [[20.0, 60.0], [22.0, 58.0], [19.0, 61.0], [21.0, 59.0]]
 

@@ -8,8 +8,8 @@ from truth import scenario
 
 from factorgraph_dvl.analysis.convergence import check_limits, convergence, short_of_limits
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solution import Estimate
 
 
 def test_convergence_is_the_last_time_that_a_limit_is_crossed():

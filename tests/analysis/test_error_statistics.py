@@ -12,9 +12,10 @@ from factorgraph_dvl.analysis.error_statistics import (
     trajectory_errors,
     true_value_of,
 )
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Reference
 
 

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.report.files.instrument import instrument_text
-from factorgraph_dvl.solution import Estimate
 
 STD = np.array([0.02, 0.03, 0.04])
 

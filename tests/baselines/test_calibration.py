@@ -19,7 +19,7 @@ from factorgraph_dvl.cli.solve import KalmanMethod
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.solution_folder import load_solution
 from factorgraph_dvl.files.tables import read_table
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 

@@ -12,7 +12,7 @@ from truth import scenario
 from factorgraph_dvl.baselines import kalman
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 

@@ -16,7 +16,7 @@ from factorgraph_dvl.analysis.error_statistics import (
 from factorgraph_dvl.baselines import kalman
 from factorgraph_dvl.baselines.navigation import motion_at, navigate
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 

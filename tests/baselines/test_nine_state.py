@@ -12,7 +12,7 @@ from truth import SWELL, scenario
 from factorgraph_dvl.baselines import calibrate, kalman
 from factorgraph_dvl.baselines.nine_state import nine_state
 from factorgraph_dvl.geometry.rotations import exp_so3
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 

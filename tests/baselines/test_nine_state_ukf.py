@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from kalman_trials import MISALIGNMENT, SCALE, exact_points, parameter
 
-from factorgraph_dvl.baselines.nine_state import nine_state, with_bias
-from factorgraph_dvl.baselines.nine_state_ukf import unscented
+from factorgraph_dvl.baselines.nine_state import nine_state, unscented, with_bias
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 

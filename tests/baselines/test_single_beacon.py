@@ -12,9 +12,10 @@ from planar import STRAIGHT, changed, error_of, trial
 from factorgraph_dvl.baselines.single_beacon import filter_planar
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.trial_folder import save_trial
-from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.solution import Residuals, contradictions
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.results import contradictions
 from factorgraph_dvl.trial import InitialPosition
 
 

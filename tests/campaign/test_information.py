@@ -8,9 +8,10 @@ from scipy.linalg import block_diag
 
 from factorgraph_dvl.campaign.information import TrialCalibration, information_of
 from factorgraph_dvl.campaign.model import fit
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.sensors.dvl import LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import ParameterSpec
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.solution import Calibration
 
 SHARED = (MISALIGNMENT_SPEC, SCALE_SPEC, LEVER_ARM_SPEC)
 DAILY = ParameterSpec("gyro_bias", "deg_h", frame="b")

@@ -9,9 +9,9 @@ import pytest
 from gaussian_trials import SIGMA, gaussian_trials, remount
 from scipy.stats import binom, chi2
 
-from factorgraph_dvl.campaign.between_trials import fitted, probabilities
+from factorgraph_dvl.campaign.changes import normal_equivalent, supremum_probability
 from factorgraph_dvl.campaign.joint_calibration import joint_calibration
-from factorgraph_dvl.campaign.supremum import normal_equivalent, supremum_probability
+from factorgraph_dvl.campaign.model import fitted, probabilities
 
 DAYS = np.arange(40.0)
 RUNS = 10 * int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "50"))

@@ -19,7 +19,7 @@ from factorgraph_dvl.cli.commands import COMMANDS, command
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.files.solution_folder import load_solution
 from factorgraph_dvl.files.trial_folder import load_trial
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import Scenario, load_scenario
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.statistics.information_history import InformationHistory

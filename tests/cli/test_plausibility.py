@@ -19,10 +19,9 @@ from factorgraph_dvl.files.calibration_file import load_calibration
 from factorgraph_dvl.files.solution_folder import save_solution
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.quality.refusal import explained
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import explained, survey
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay import replay
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.simulation import simulate
 
 

@@ -16,7 +16,8 @@ from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 from truth import scenario
 
-from factorgraph_dvl.cli.memory import naming_memory
+from factorgraph_dvl.cli.commands import naming_memory
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.files.solution_folder import save_solution
 
@@ -137,7 +138,7 @@ def test_too_little_memory_says_what_the_trial_takes(tmp_path: Path) -> None:
     assert f"{samples} IMU samples" in str(caught.value)
     assert "about 0.3 GB" in str(caught.value)
     assert "lower rate" in str(caught.value)
-    assert caught.value.exit_code == 1
+    assert exit_code_of(caught.value) == 1
 
 
 def test_names_give_a_terminal_no_orders(tmp_path: Path, run: Run) -> None:

@@ -11,10 +11,10 @@ from builders import build_solution, build_trial, edit, write_trial
 from running import Run
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.solution_folder import save_solution
 from factorgraph_dvl.files.trial_folder import load_trial
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.quality.finding import Code, Finding
 
 REASON = "DVL velocity: residuals are 14 times as large as stated"
 REFUSAL = f"graded `do not use`: {REASON}"

@@ -7,7 +7,6 @@ their cells are no sentences.
 from __future__ import annotations
 
 import ast
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,8 @@ from typer.main import get_command
 from factorgraph_dvl.cli.app import app
 from factorgraph_dvl.cli.commands import COMMANDS
 from factorgraph_dvl.cli.commands import command as command_named
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.texts import catalogue
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "factorgraph_dvl"
@@ -129,8 +129,7 @@ def test_findings_are_plain():
 
 
 def test_sentences_of_the_report_are_plain():
-    phrases = json.loads((PACKAGE / "report" / "html" / "chinese.json").read_text("utf-8"))
-    wrong = found((text, text) for text in phrases["phrases"] if text.endswith("."))
+    wrong = found((text, text) for text in catalogue("phrases") if text.endswith("."))
     assert not wrong, "\n".join(wrong)
 
 

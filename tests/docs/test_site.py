@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import factorgraph_dvl
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

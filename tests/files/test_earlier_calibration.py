@@ -22,8 +22,8 @@ from factorgraph_dvl.files.earlier_calibration import calibrated_by, with_biases
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay import replay
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import BIASES
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Calibration

@@ -13,7 +13,7 @@ from factorgraph_dvl.campaign.record import RunRecord
 from factorgraph_dvl.campaign.trials import assembled
 from factorgraph_dvl.files.calibration_file import load_calibration
 from factorgraph_dvl.files.solution_folder import load_solution, read_history
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 
 # Of 70 s of `configs/ship-water.yaml`, by the smoother of trials without IMU before they were on
 # the graph (commit 77d8f00): `solve ship --no-figures --rate 0.2`.

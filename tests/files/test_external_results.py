@@ -10,6 +10,7 @@ import pytest
 from builders import build_solution, build_trial, write_trial
 
 from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
 from factorgraph_dvl.files.external_results import load_results, load_truth, read_truth
 from factorgraph_dvl.files.motion_table import motion_columns
@@ -102,7 +103,7 @@ def test_trajectory_from_elsewhere(tmp_path: Path) -> None:
 def test_bad_results_from_elsewhere(tmp_path: Path, text: str, name: str, expected: str) -> None:
     with pytest.raises(FactorgraphDvlError) as caught:
         foreign(tmp_path, text, name)
-    assert caught.value.exit_code == 2
+    assert exit_code_of(caught.value) == 2
     assert expected in str(caught.value)
 
 

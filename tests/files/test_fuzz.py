@@ -30,7 +30,7 @@ from factorgraph_dvl.files.segments_file import read_segments
 from factorgraph_dvl.files.solution_folder import load_solution, save_solution
 from factorgraph_dvl.files.trial_folder import load_trial, read_record, save_trial
 from factorgraph_dvl.files.trial_yaml import TrialSettings
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import survey
 from factorgraph_dvl.sensors.depth import Depth, DepthSettings
 from factorgraph_dvl.settings.yaml_file import parse_yaml
 from factorgraph_dvl.simulation import load_scenario, parse_scenario, simulate

@@ -7,8 +7,8 @@ import pytest
 from builders import build_solution
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.solution_folder import load_solution, save_solution
-from factorgraph_dvl.solution import Residuals
 
 NAN = np.nan
 

@@ -12,7 +12,7 @@ from builders import build_solution
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.solution_folder import load_solution, save_solution
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 
 
 def reject(text: str) -> float:

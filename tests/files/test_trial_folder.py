@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders import build_trial, edit, write_trial
 
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError
 from factorgraph_dvl.files.folders import new_folder
 from factorgraph_dvl.files.tables import read_table, write_table
@@ -204,7 +205,7 @@ def test_bad_settings_name_line_key_and_expectation(tmp_path: Path, case: str) -
         assert text in message
     named = int(message.split()[2].rstrip(":"))
     assert abs(named - line) <= 1, f"{message!r} is about line {line}"
-    assert caught.value.exit_code == 2
+    assert exit_code_of(caught.value) == 2
 
 
 def test_missing_keys_are_named(tmp_path: Path) -> None:
@@ -315,7 +316,7 @@ def test_bad_tables_name_line_and_column(tmp_path: Path, case: str) -> None:
     with pytest.raises(DataError) as caught:
         load_trial(path)
     assert f"{name} {expected}" in str(caught.value)
-    assert caught.value.exit_code == 2
+    assert exit_code_of(caught.value) == 2
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from factorgraph_dvl.files.earlier_calibration import calibrated_by
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph.priors import Tilt, prior_mean
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solution import Calibration

@@ -12,7 +12,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.imu.increments import increments, unbroken_increments
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 GRAVITY = np.array([0.0, 0.0, -9.8])

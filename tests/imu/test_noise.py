@@ -11,7 +11,7 @@ import pytest
 from truth import CONING, merged, scenario
 
 from factorgraph_dvl.imu.noise import white_noise, with_recorded_noise
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import NoiseModel
 from factorgraph_dvl.simulation import simulate
@@ -31,7 +31,7 @@ def swaying() -> Trial:
     return simulate(scenario(noise=True, manoeuvres=MANOEUVRES, sway=CONING), seed=1)
 
 
-def louder(imu: Imu, factor: float) -> Imu:
+def with_noise(imu: Imu, factor: float) -> Imu:
     """Return a record whose noise is so many times the stated one."""
     rng = np.random.default_rng(0)
     root = np.sqrt((factor**2 - 1.0) / np.median(np.diff(imu.time)))
@@ -59,8 +59,8 @@ def test_stated_noise_is_found_as_stated_under_sway() -> None:
     assert findings == ()
 
 
-def test_louder_noise_is_found_and_used() -> None:
-    imu = louder(swaying().imu, 3.0)
+def test_more_noise_is_found_and_used() -> None:
+    imu = with_noise(swaying().imu, 3.0)
     assert ratios(imu) == pytest.approx((3.0, 3.0), rel=0.05)
     changed, findings = with_recorded_noise(imu)
     assert changed.settings.gyro_noise_root_psd == pytest.approx(
@@ -103,7 +103,7 @@ def test_records_that_do_not_tell(jitter: float) -> None:
 def test_the_solver_uses_it_unless_noise_is_as_stated() -> None:
     quiet = merged({"noise": True, "manoeuvres": [{"straight_s": 60}]}, {"gnss": {"rate_hz": 1}})
     trial = simulate(scenario(**quiet), seed=3)
-    trial = replace(trial, imu=louder(trial.imu, 3.0))
+    trial = replace(trial, imu=with_noise(trial.imu, 3.0))
 
     def prepared(noise: NoiseModel) -> tuple[float, set[str]]:
         given = prepare(replace(trial, noise=noise), 1.0, lambda *_: None)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from builders import build_trial
 
-from factorgraph_dvl.imu.timestamps import fill_lost, unrounded, without_strays
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.imu.timestamps import fill_lost, unrounded, without_restarted_clock
+from factorgraph_dvl.quality.finding import Code
 
 
 def test_stamps_in_milliseconds_of_a_regular_clock_become_regular():
@@ -57,9 +57,9 @@ def test_samples_of_another_clock_are_left_out_where_no_sensor_measured():
         gyro=np.concatenate([imu.gyro[:5], imu.gyro]),
         accel=np.concatenate([imu.accel[:5], imu.accel]),
     )
-    found = without_strays(replace(trial, imu=early))
+    found = without_restarted_clock(replace(trial, imu=early))
     np.testing.assert_array_equal(found.imu.time, imu.time)
     (note,) = found.notes[len(trial.notes) :]
     assert note.code is Code.CLOCK_RESTARTED
     assert "the 5 samples" in note.text
-    assert without_strays(trial) is trial
+    assert without_restarted_clock(trial) is trial

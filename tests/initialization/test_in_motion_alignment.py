@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 
 INITIAL = {"initial": {"attitude_std_deg": [0.5, 0.5, 2.0], "position_std_m": [1, 1, 1]}}

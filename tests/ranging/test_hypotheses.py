@@ -7,8 +7,8 @@ import pytest
 from findings import of_code
 from planar import STRAIGHT, error_of, trial, truth
 
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.ranging.planar_solution import solve_planar
-from factorgraph_dvl.sensors.finding import Code
 
 
 def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():

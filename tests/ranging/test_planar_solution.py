@@ -13,11 +13,12 @@ from planar import BASE, STRAIGHT, changed, error_of, trial
 from factorgraph_dvl import kalman, predict, solve
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
+from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.solution_folder import load_solution
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
+from factorgraph_dvl.quality.results import mostly_rejected
 from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.simulation import parse_scenario
-from factorgraph_dvl.solution import Residuals, mostly_rejected
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 

@@ -9,10 +9,10 @@ import pytest
 from planar import STRAIGHT, changed, trial
 
 from factorgraph_dvl.errors import DataError, SolveError
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.ranging.problem import planar_setup
-from factorgraph_dvl.sensors.finding import Code
 
 SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
 

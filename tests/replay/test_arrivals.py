@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from truth import scenario
 
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.arrivals import AHEAD, Clocks, Duplicates, Outages, PendingMeasurements
 from factorgraph_dvl.replay.record import Innovations
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 

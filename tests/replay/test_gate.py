@@ -10,9 +10,9 @@ import pytest
 
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay import gate
 from factorgraph_dvl.replay.gate import InnovationGate, _one_after_another, gated
-from factorgraph_dvl.sensors.finding import Code
 
 
 def test_a_kind_of_outliers_is_excluded_until_it_agrees():

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from truth import scenario
 
+from factorgraph_dvl.estimates import Estimate, Trajectory
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
 from factorgraph_dvl.replay.playback import VerdictAsItGoes
 from factorgraph_dvl.replay.record import Update
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solution import Estimate, Trajectory
 
 NOWHERE = Trajectory(*(np.zeros(0) for _ in range(7)))
 

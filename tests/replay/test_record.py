@@ -6,10 +6,10 @@ from dataclasses import fields
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate, Trajectory
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
 from factorgraph_dvl.replay.record import Innovations, Recorder, Update
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.solution import Estimate, Trajectory
 
 
 def trajectory(time):

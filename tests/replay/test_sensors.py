@@ -13,8 +13,9 @@ from truth import CORRELATED, config
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.graph.processes import walk_sigma, walk_time
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.replay import Replay, replay
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
@@ -109,7 +110,7 @@ def test_star_vectors_one_epoch_at_a_time():
     seen = Star.from_vectors(
         star.settings, time, body.reshape(-1, 3), inertial.reshape(-1, 3), "star"
     )
-    assert rows_of(seen, [3, 4]).findings() == ()
+    assert star_catalogue_findings([rows_of(seen, [3, 4])]) == ()
     early = trial.imu.time < 34.0
     trial = replace(trial, imu=rows_of(trial.imu, early), others=(seen,))
     solution, _ = replay(trial, rate_hz=1.0)

@@ -15,10 +15,10 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors, motion
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.files.tables import read_table
-from factorgraph_dvl.quality.survey import Survey
+from factorgraph_dvl.plausibility.survey import Survey
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.report.terminal.live import live_view
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problems

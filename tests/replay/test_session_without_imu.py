@@ -13,10 +13,10 @@ from truth import CONFIGS, SCHULER, with_ins
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay import replay
 from factorgraph_dvl.replay.calibration import CalibrationReport
 from factorgraph_dvl.replay.window import Window
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from exactness import worst_relative
 
+from factorgraph_dvl.message import Message
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import solve_start
-from factorgraph_dvl.sensors.message import Message
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.posterior import posterior
 

@@ -14,8 +14,8 @@ from truth import config, exact_motion, scenario
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.depth import Depth, DepthBelowSurface, DepthSettings
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve

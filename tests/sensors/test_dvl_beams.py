@@ -35,7 +35,8 @@ from factorgraph_dvl.geometry.unit_vectors import tangent_axes, turned, turned_j
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.planning.prediction import extend, predict
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.report.figures.observability import (
     history_figure,
     write_observability_figures,
@@ -51,7 +52,6 @@ from factorgraph_dvl.sensors.beam_geometry import (
     velocities,
 )
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve

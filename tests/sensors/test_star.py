@@ -37,8 +37,9 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import ARCSEC, DEG
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.quality.survey import survey
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.sensors.star import Star, StarAttitude, StarSettings
 from factorgraph_dvl.simulation import plan_motion, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -724,7 +725,7 @@ def test_a_star_that_does_not_fit_its_catalogue_is_named(off_arcsec, severity):
     trial = simulate(config("star", **SHORT, star={"stars": bright}), 0)
     star = star_of(trial)
     assert star.misfit == pytest.approx(1.0, abs=0.1)
-    assert star.findings() == ()
+    assert star_catalogue_findings([star]) == ()
     v = star.vectors
     moved = v.inertial.copy()
     moved[2::5] = Rotation.from_rotvec([0, off_arcsec * ARCSEC, 0]).apply(moved[2::5])
@@ -746,7 +747,7 @@ def test_a_few_stars_may_scatter_more():
     body = catalogue + rng.normal(0.0, 2.0 * 5.0 * ARCSEC, catalogue.shape)
     # Twice as much, but of one degree of freedom.
     star = Star.from_vectors(StarSettings(), np.zeros(2), body, catalogue, "star.csv")
-    assert star.findings() == ()
+    assert star_catalogue_findings([star]) == ()
 
 
 # Monte Carlo

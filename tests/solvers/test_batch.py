@@ -14,10 +14,10 @@ from truth import CONING, config, scenario
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solution import most_probable_minimum
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.minima import most_probable_minimum
 
 STRAIGHT = {"manoeuvres": [{"straight_s": 60}], "sway": {}}
 

@@ -10,7 +10,7 @@ import yaml
 from msgspec import structs
 from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, merged, scenario
 
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
 

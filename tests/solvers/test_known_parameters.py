@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from truth import TURNS_AND_BRAKING, merged, scenario
 
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, simulate
 from factorgraph_dvl.solvers.batch import solve
 

@@ -20,9 +20,7 @@ SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 def test_a_ping_counts_as_evidence_by_any_of_its_beams():
     residual = np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])
     problem = SimpleNamespace(
-        observations=[SimpleNamespace(gate=2.0, label="Range", time=np.zeros(2))],
-        usable={"Range": np.array([True, False])},
-        log_sigma=lambda _: [np.array([3.0, 0.0])],
+        log_sigma=lambda _: [np.array([3.0, 2.0])],
     )
     minimum = SimpleNamespace(evaluation=SimpleNamespace(residuals=[residual], cost=20.0))
     terms = minima.cost_terms(SimpleNamespace(problem=problem, minimum=minimum))

@@ -10,7 +10,7 @@ from monte_carlo import RUNS
 from truth import TURNING, config, scenario
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, simulate
 from factorgraph_dvl.solvers.batch import solve
 

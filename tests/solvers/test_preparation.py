@@ -11,7 +11,7 @@ import solved
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.solvers.preparation import mounted_start, prepare
 
 

@@ -18,7 +18,7 @@ from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solve_with_problem
 from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import solved
 
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solvers.summary import summarise
 
 

@@ -11,7 +11,7 @@ import pytest
 from truth import merged, scenario
 
 from factorgraph_dvl.graph.problem import Rows
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.statistics.constancy import changes

@@ -9,7 +9,7 @@ import pytest
 from stated_noise import stated
 from truth import CONING, merged, scenario
 
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 

@@ -17,10 +17,11 @@ from truth import config
 from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
 from factorgraph_dvl.analysis.error_statistics import nees_band, trajectory_errors
 from factorgraph_dvl.baselines import sins
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.earlier_calibration import calibrated_by
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solution import Calibration, Estimate
+from factorgraph_dvl.solution import Calibration
 from factorgraph_dvl.solvers.batch import solve
 
 RUNS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "6"))

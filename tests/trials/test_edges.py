@@ -16,8 +16,8 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.imu.attitude_history import AttitudeHistory
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.replay import replay
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 

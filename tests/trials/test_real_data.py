@@ -16,8 +16,8 @@ from factorgraph_dvl.geometry.rotations import frd_from_body, log_so3, rotation_
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.sensors.protocol import Motion

@@ -12,9 +12,9 @@ from dives import dive
 from scipy.stats import chi2
 
 from factorgraph_dvl.files.trial_folder import load_trial
-from factorgraph_dvl.quality.survey import survey
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.dvl import DvlSettings
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.imu import COLUMNS
 from factorgraph_dvl.sensors.ins import InsSettings
 from factorgraph_dvl.solvers.batch import solve

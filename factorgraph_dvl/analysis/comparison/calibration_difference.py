@@ -14,11 +14,12 @@ from factorgraph_dvl.analysis.error_statistics import (
     nearest_angle,
     nearest_rotation_vector,
 )
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Calibration, Estimate, Solution
+from factorgraph_dvl.solution import Calibration, Solution
 
 _Result = TypeVar("_Result", Solution, Calibration)
 Side = Literal["A", "B"]

@@ -11,8 +11,10 @@ from factorgraph_dvl.analysis.comparison.calibration_difference import (
     Component,
     Side,
 )
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.geometry.rotations import log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.dvl import (
     BIAS,
     CURRENT,
@@ -21,8 +23,7 @@ from factorgraph_dvl.sensors.dvl import (
     SCALE_ERROR,
     TIME_OFFSET,
 )
-from factorgraph_dvl.sensors.finding import Code
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 
 # Parameters of the DVL's measurement equation: if a result omits one, its effect biases the
 # others.

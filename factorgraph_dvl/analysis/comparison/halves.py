@@ -11,10 +11,10 @@ from scipy.special import chdtrc
 from factorgraph_dvl.analysis.comparison.calibration_difference import same_branch
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.earlier_calibration import CONTRADICTED_P, DOUBTFUL_P
-from factorgraph_dvl.sensors.finding import Code, Finding
+from factorgraph_dvl.message import message
+from factorgraph_dvl.plausibility.earlier_calibration import CONTRADICTED_P, DOUBTFUL_P
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.message import message
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Solution

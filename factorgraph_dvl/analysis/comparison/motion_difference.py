@@ -13,9 +13,9 @@ from factorgraph_dvl.analysis.comparison.calibration_difference import (
     std_of_difference,
 )
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors, motion_errors
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 COMPONENTS = (

@@ -21,6 +21,7 @@ from factorgraph_dvl.analysis.information.segment_singular_values import (
     point_set_rows,
     singular_values,
 )
+from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes, log_so3, rotation_from_rph, rph_jacobian
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -35,7 +36,7 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION as BEAM_DIRECTION
 from factorgraph_dvl.sensors.dvl_beams import SCALE_ERROR as BEAM_SCALE_ERROR
-from factorgraph_dvl.solution import Estimate, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 # Parameters of a DVL, of single beams, and those that have columns only if they are estimated.
@@ -109,17 +110,11 @@ def point_set(
     margin : float
         Argument of `singular_values`, s.
     """
+    found = _parameters(solution, trial)
+    if isinstance(found, str):
+        return None, [f"singular values: {found}"]
+    always, parts = found
     by_name = {e.name: e for e in solution.estimates}
-    if trial is not None and trial.log is None:
-        return None, ["singular values: the trial has no DVL"]
-    of_beams = by_name.keys() >= set(_OF_BEAMS) and (trial is None or trial.dvl is None)
-    always = _OF_BEAMS if of_beams else _ALWAYS
-    if not by_name.keys() >= set(always):
-        return None, ["singular values: the solution does not calibrate a DVL"]
-    parts = [by_name[name] for name in always]
-    parts += [by_name[n] for n in _IF_ESTIMATED if n in by_name and _is_estimated(by_name[n])]
-    if not all(np.isfinite(e.value).all() for e in parts):
-        return None, ["singular values: the calibration has no values to linearise at"]
     names = tuple(n for e in parts for n in e.component_names)
     scale, how = _prior_scale(parts)
     si = np.concatenate([np.full(e.value.size, _SI.get(e.name, 1.0)) for e in parts])
@@ -142,25 +137,13 @@ def point_set(
 
     def rows(v_b: Array, omega_b: Array, others: Mapping[str, Array]) -> Array:
         moving = BodyMotion(at.time, v_b, omega_b)
-        own = [
-            np.broadcast_to(others[name], (at.time.size, *others[name].shape[-2:]))
-            for name in further
-        ]
-        base = (
-            beam_rows(moving, mounting)
-            if isinstance(mounting, BeamMounting)
-            else point_set_rows(moving, mounting)
-        )
-        whole = np.concatenate([base, *own], axis=2)
+        whole = _rows(moving, mounting, [others[name] for name in further])
         return (whole * (scale * si) / sigma[:, :, None])[:, :, free]
 
     none = np.zeros_like(at.v_b)
     nothing = {BIAS: np.zeros((3, 3)), CURRENT: np.zeros((3, 2))}
     epoch = np.clip(np.searchsorted(motion.time, at.time - 1e-6), 0, motion.time.size - 1)
-    velocity_root = _root(bRn @ relative.velocity_cov @ bRn.transpose(0, 2, 1))[epoch]
-    to_body = np.linalg.inv(rph_jacobian(relative.rph, axes))
-    varying = _varying(relative.rph_cov)
-    attitude_root = _root(to_body @ varying @ to_body.transpose(0, 2, 1))[epoch]
+    velocity_root, attitude_root = (root[epoch] for root in _motion_roots(relative, axes, bRn))
     rate_sigma = _rate_sigma(trial, relative, axes)
     spurious = np.zeros((at.time.size, len(states), len(states)))
     for k in range(3):
@@ -183,6 +166,49 @@ def point_set(
     )
     view = PointSet(states, scale[free], f"{how}, {source}", single, cumulative)
     return view, _taken_as_known(by_name, trial)
+
+
+def _rows(
+    moving: BodyMotion, mounting: MountingModel | BeamMounting, further: Sequence[Array]
+) -> Array:
+    """Return the rows of pings (M,): of the mounting, then further columns."""
+    if isinstance(mounting, BeamMounting):
+        base = beam_rows(moving, mounting)
+    else:
+        base = point_set_rows(moving, mounting)
+    own = [np.broadcast_to(x, (moving.time.size, *x.shape[-2:])) for x in further]
+    return np.concatenate([base, *own], axis=2)
+
+
+def _motion_roots(motion: Trajectory, axes: BodyAxes, bRn: Array) -> tuple[Array, Array]:
+    """Return roots of the covariances of velocity and attitude in body axes, (N, 3, 3) each."""
+    to_body = np.linalg.inv(rph_jacobian(motion.rph, axes))
+    varying = _varying(motion.rph_cov)
+    return (
+        _root(bRn @ motion.velocity_cov @ bRn.transpose(0, 2, 1)),
+        _root(to_body @ varying @ to_body.transpose(0, 2, 1)),
+    )
+
+
+def _parameters(
+    solution: Solution, trial: Trial | None
+) -> tuple[tuple[str, ...], list[Estimate]] | str:
+    """Return names of the parameters that have columns always, and all parameters that have some.
+
+    Or why there is nothing to linearise.
+    """
+    by_name = {e.name: e for e in solution.estimates}
+    if trial is not None and trial.log is None:
+        return "the trial has no DVL"
+    of_beams = by_name.keys() >= set(_OF_BEAMS) and (trial is None or trial.dvl is None)
+    always = _OF_BEAMS if of_beams else _ALWAYS
+    if not by_name.keys() >= set(always):
+        return "the solution does not calibrate a DVL"
+    parts = [by_name[name] for name in always]
+    parts += [by_name[n] for n in _IF_ESTIMATED if n in by_name and _is_estimated(by_name[n])]
+    if not all(np.isfinite(e.value).all() for e in parts):
+        return "the calibration has no values to linearise at"
+    return always, parts
 
 
 def _is_estimated(e: Estimate) -> bool:

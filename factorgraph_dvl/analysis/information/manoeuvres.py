@@ -14,11 +14,11 @@ from itertools import pairwise
 import numpy as np
 
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.imu.timestamps import JUMP
 from factorgraph_dvl.sensors.records import rows_of
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 # Chosen: a Hann window, s, removes periods below half its length; most waves are shorter than

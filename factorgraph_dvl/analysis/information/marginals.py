@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.analysis.information.segment_singular_values import dominant, readable_basis
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.grades import DEFAULT_LIMITS, Grade
-from factorgraph_dvl.sensors.message import Message, message, together
-from factorgraph_dvl.solution import Estimate, grades_of
+from factorgraph_dvl.message import Message, message, together
+from factorgraph_dvl.quality.verdict import DEFAULT_LIMITS, Grade, grades_of
 
 # Chosen: a direction is undetermined if at least half of the prior's σ remains; above the second
 # share the data do not inform it at all.

@@ -20,6 +20,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.rotations import (
     BodyAxes,
     exp_so3,
@@ -30,7 +31,6 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.unit_vectors import turned
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.sensors.beam_model import FreeGeometry
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 # Chosen: the posterior standard deviation is half the prior's, 1 / sqrt(1 + s²) = 1 / 2.

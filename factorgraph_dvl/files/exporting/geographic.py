@@ -8,7 +8,7 @@ from xml.sax.saxutils import escape
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.files.exporting.motion import ExportedMotion, iso_times
+from factorgraph_dvl.files.exporting.trajectories import ExportedMotion, iso_times
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_dvl.files.exporting.motion import ExportedMotion
+from factorgraph_dvl.files.exporting.trajectories import ExportedMotion
 from factorgraph_dvl.files.formats.clocks import GPS_EPOCH, utc_to_gps
 from factorgraph_dvl.files.formats.sbet import SBET, SMRMSG
 from factorgraph_dvl.geometry.rotations import frd_from_body, rotation_from_rph

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.files.exporting.bag import write_mcap
 from factorgraph_dvl.files.exporting.pd0 import write_pd0
-from factorgraph_dvl.files.output_file import write_file
+from factorgraph_dvl.files.folders import write_file
 from factorgraph_dvl.files.trial_folder import load_trial, locate, save_trial
 from factorgraph_dvl.sensors.protocol import SensorRecord
 from factorgraph_dvl.settings.yaml_file import read_text

@@ -1,7 +1,7 @@
 """Nortek AD2CP files: bottom track, orientation and the configuration they begin with.
 
 Source: Nortek, Signature Integrator's Guide (2017), 6.1 (header, DF20 bottom track, DF3
-records); AHRS fields as in the DF3 table. `ad2cp_tracks` has the records of DVLs. Records of other
+records); AHRS fields as in the DF3 table. 0x1B and 0x1D are the records of DVLs. Records of other
 kinds are passed over, whole.
 """
 
@@ -9,19 +9,24 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from factorgraph_dvl.files.formats import ad2cp_tracks
 from factorgraph_dvl.files.formats.clocks import posix
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, number
+from factorgraph_dvl.files.formats.format import Batch, Format, Kind, empty, left_out
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file, number
 from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
+from factorgraph_dvl.files.formats.nmea import join, read_nmea, sentence_batches
+from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
 
-ENU, XYZ, BEAM = range(3)
+IN_ENU, IN_XYZ, IN_BEAMS = range(3)
 BOTTOM, BURST, AVERAGE, TEXT = 0x17, 0x15, 0x16, 0xA0
 # Nucleus frames its packets alike, with kinds of its own.
 NUCLEUS = 0x20
@@ -93,7 +98,7 @@ class Ad2cp:
         `velocity` m/s by beam or axis, `distance` m, `merit` (figure of merit), nan where
         not measured; `rotation`, `quaternion` and `rate` (rad/s) of the AHRS, nan without.
     tracks : Records
-        (M,) of `ad2cp_tracks.TRACK`, bottom and water track of DVLs.
+        (M,) of `TRACK`, bottom and water track of DVLs.
     text : tuple of str
         String records, in order: configuration, and sentences that were sent to it.
     """
@@ -130,18 +135,18 @@ def read_ad2cp(
             continue
         if kind == BOTTOM:
             pings.append((start, source[start:stop]))
-        elif kind in (ad2cp_tracks.BOTTOM, ad2cp_tracks.WATER):
+        elif kind in (DVL_BOTTOM, DVL_WATER):
             record = source[start:stop]
-            if ad2cp_tracks.is_whole(record):
+            if is_whole(record):
                 dvl.append((start, kind, record))
             else:
                 losses.add(_IMPOSSIBLE, start)
         elif kind == TEXT:
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
         if len(pings) + len(dvl) + len(text) >= block:
-            yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
+            yield Ad2cp(_bottom_track(pings, losses), tracks(dvl), tuple(text))
             pings, dvl, text = [], [], []
-    yield Ad2cp(_bottom_track(pings, losses), ad2cp_tracks.tracks(dvl), tuple(text))
+    yield Ad2cp(_bottom_track(pings, losses), tracks(dvl), tuple(text))
 
 
 def beam_matrix(text: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]] | None:
@@ -294,3 +299,204 @@ def _mark_lost(pings: Records) -> None:
     lost |= np.abs(pings["velocity"]) > _FASTEST
     pings["velocity"] = np.where(lost, np.nan, pings["velocity"])
     pings["distance"] = np.where(pings["distance"] <= 0.0, np.nan, pings["distance"])
+
+
+DVL_BOTTOM, DVL_WATER = 0x1B, 0x1D
+_RECORD = np.dtype(
+    [
+        ("version", "u1"),
+        ("offset", "u1"),
+        ("serial", "<u4"),
+        ("date", "6u1"),
+        ("fraction", "<u2"),
+        ("beams", "<u2"),
+        ("error", "<u4"),
+        ("status", "<u4"),
+        *((name, "<f4") for name in ("sound_speed", "temperature", "pressure")),
+        *((f"beam_{name}", "4<f4") for name in ("velocity", "range", "merit")),
+        *((f"beam_{name}", "4<f4") for name in ("delay", "delay_to_output", "duration")),
+        *((name, "4<f4") for name in ("velocity", "merit", "delay", "delay_to_output")),
+        ("duration", "4<f4"),
+    ]
+)
+# First of four bits in the status that say what is valid, of beams and of X, Y, Z1, Z2.
+_BITS = {"beam_velocity": 0, "beam_range": 4, "velocity": 12}
+# What stands for a velocity that was not measured, m/s, and for its standard deviation.
+_NO_VELOCITY, _NO_MERIT = -32.0, 10.0
+# Time from trigger to echo, s, that no range explains. Chosen: 7 km.
+_LONGEST_DELAY = 10.0
+
+TRACK = np.dtype(
+    [
+        ("at", "i8"),
+        ("water", "?"),
+        ("time", "f8"),
+        ("velocity", "f8", (3,)),
+        ("error", "f8"),
+        ("merit", "f8", (3,)),
+        ("delay", "f8"),
+        *((f"beam_{name}", "f8", (4,)) for name in ("velocity", "range", "merit")),
+        *((name, "f8") for name in ("sound_speed", "temperature", "pressure")),
+    ]
+)
+
+
+def is_whole(record: bytes) -> bool:
+    """Return whether a record has all fields."""
+    return len(record) >= _RECORD.itemsize
+
+
+def tracks(records: Sequence[tuple[int, int, bytes]]) -> Records:
+    """Return what records hold that are whole.
+
+    Parameters
+    ----------
+    records : sequence of (int, int, bytes)
+        Position, kind (`DVL_BOTTOM` or `DVL_WATER`) and content.
+
+    Returns
+    -------
+    Records
+        (N,) of `TRACK`: `time` of the trigger, seconds since 1970; `delay` from it to the echo, s;
+        `velocity` X, Y, Z, m/s, Z the mean of two, and `error` half their difference; `merit`, the
+        instrument's own standard deviation, m/s; nan where not measured.
+    """
+    raw = np.frombuffer(
+        b"".join(content[: _RECORD.itemsize] for _, _, content in records), _RECORD
+    )
+    out = np.zeros(len(raw), TRACK)
+    out["at"] = [at for at, _, _ in records]
+    out["water"] = [kind == DVL_WATER for _, kind, _ in records]
+    # Years count from 1900 and months from 0, as in C.
+    year, month, day, hour, minute, second = raw["date"].astype(np.int64).T
+    out["time"] = posix(year + 1900, month + 1, day, hour, minute, second + raw["fraction"] * 1e-4)
+    for name in ("sound_speed", "temperature", "pressure"):
+        out[name] = _finite(raw[name])
+    velocity, merit, delay = (_finite(raw[name]) for name in ("velocity", "merit", "delay"))
+    velocity[~_valid(raw, "velocity") | (velocity <= _NO_VELOCITY)] = np.nan
+    both = np.isfinite(velocity[:, 2:]).all(axis=1)
+    vertical = np.where(np.isfinite(velocity[:, 2]), velocity[:, 2], velocity[:, 3])
+    vertical[both] = velocity[both, 2:].mean(axis=1)
+    out["velocity"] = np.column_stack([velocity[:, :2], vertical])
+    out["error"] = (velocity[:, 2] - velocity[:, 3]) / 2.0
+    merit[(merit <= 0.0) | (merit >= _NO_MERIT)] = np.nan
+    out["merit"] = np.where(np.isfinite(out["velocity"]), merit[:, :3], np.nan)
+    likely = (delay > 0.0) & (delay < _LONGEST_DELAY)
+    number = likely[:, :3].sum(axis=1)
+    total = np.where(likely, delay, 0.0)[:, :3].sum(axis=1)
+    out["delay"] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    for name in ("velocity", "range", "merit"):
+        out[f"beam_{name}"] = _finite(raw[f"beam_{name}"])
+    lost = ~_valid(raw, "beam_velocity") | (out["beam_velocity"] <= _NO_VELOCITY)
+    out["beam_velocity"][lost] = np.nan
+    out["beam_merit"][lost | (out["beam_merit"] >= _NO_MERIT)] = np.nan
+    far = ~_valid(raw, "beam_range") | (out["beam_range"] <= 0.0)
+    out["beam_range"][far] = np.nan
+    return out
+
+
+def _valid(raw: Records, name: str) -> NDArray[np.bool_]:
+    return (raw["status"][:, None] >> (_BITS[name] + np.arange(4, dtype=np.uint32)) & 1) > 0
+
+
+def _finite(values: Records) -> Array:
+    out = values.astype(float)
+    out[~np.isfinite(out)] = np.nan
+    return out
+
+
+_BEAMS = (
+    "velocities along beams are positive towards the transducer, which is its own velocity along "
+    "the outward beam; directions of beams by the matrix GETXFBT of the file"
+)
+_NO_MATRIX = "velocities along beams, and no matrix in the file: left out"
+_MAGNETIC = "headings of the instrument's own magnetic compass"
+_TRACK = "velocities X, Y, Z of a DVL as they are: positive where it moves along its axes"
+_SHIFT = "stamps of velocities were shifted by DT1, from the trigger to the echo"
+
+
+def share(path: Path, sample: bytes) -> float:
+    """Return the share of a sample that lies in records whose checksums are right."""
+    return covered(sample) / len(sample) if sample else 0.0
+
+
+def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    """Read a file; the parameters and the result are those of `Format.read`."""
+    matrix: np.ndarray[Any, np.dtype[np.float64]] | None = None
+    losses = Losses()
+    for block in read_ad2cp(map_file(path), losses=losses):
+        for text in block.text:
+            found = beam_matrix(text)
+            matrix = matrix if found is None else found
+        if len(block.bottom):
+            yield from _batches(block.bottom, matrix)
+        if len(block.tracks):
+            yield from _tracks(block.tracks)
+        sentences = "\r\n".join(block.text).encode("latin-1")
+        nmea = join(read_nmea(sentences))
+        stamps = np.concatenate([block.bottom["time"], block.tracks["time"]])
+        stamps = stamps[np.isfinite(stamps)]
+        yield from sentence_batches(nmea, float(np.median(stamps)) if len(stamps) else None)
+    yield left_out(losses)
+
+
+def _batches(
+    bottom: Records, matrix: np.ndarray[Any, np.dtype[np.float64]] | None
+) -> Iterator[Batch]:
+    out = empty("dvl", len(bottom))
+    for name in ("at", "number", "roll", "pitch", "heading", "sound_speed", "temperature"):
+        out[name] = bottom[name]
+    out["time"] = out["received"] = bottom["time"]
+    out["range"], out["alignment"] = bottom["distance"], 0.0
+    out["tilts_used"] = True
+    out["axes"] = np.where(bottom["coordinates"] == IN_ENU, EARTH, INSTRUMENT)
+    in_beams = bottom["coordinates"] == IN_BEAMS
+    out["velocity"] = np.where(in_beams[:, None], np.nan, bottom["velocity"][:, :3])
+    notes: tuple[str, ...] = ()
+    directions: tuple[tuple[float, ...], ...] = ()
+    if in_beams.any():
+        notes = (_NO_MATRIX,)
+        if matrix is not None and matrix.shape == (4, 4):
+            beams = bottom["velocity"][in_beams]
+            out["beams"][in_beams], out["velocity"][in_beams] = beams, beams @ matrix[:3].T
+            out["axes"][in_beams] = BEAM
+            notes = (_BEAMS,)
+            directions = tuple(map(tuple, np.linalg.pinv(matrix[:3]).tolist()))
+    yield Batch("dvl", out, "own", "bottom", notes=notes, directions=directions)
+    attitude = empty("attitude", len(bottom))
+    for name in ("at", "time", "roll", "pitch", "heading"):
+        attitude[name] = bottom[name]
+    attitude["received"] = bottom["time"]
+    yield Batch("attitude", attitude, "own", "leader", "", "magnetic", (_MAGNETIC,))
+
+
+def _tracks(tracks: Records) -> Iterator[Batch]:
+    kinds: tuple[tuple[Kind, str, bool], ...] = (
+        ("dvl", "bottom", False),
+        ("water", "water", True),
+    )
+    for kind, stream, is_water in kinds:
+        part = tracks[tracks["water"] == is_water]
+        if not len(part):
+            continue
+        out = empty(kind, len(part))
+        for name in ("at", "time", "velocity", "error", "delay", "sound_speed", "temperature"):
+            out[name] = part[name]
+        out["received"], out["std"] = part["time"], part["merit"]
+        out["beams"], out["range"] = part["beam_velocity"], part["beam_range"]
+        out["axes"], out["alignment"] = INSTRUMENT, 0.0
+        shifted = (_SHIFT,) if np.isfinite(out["delay"]).any() else ()
+        yield Batch(kind, out, "own", stream, notes=(_TRACK, *shifted))
+
+
+FORMATS = (
+    Format(
+        "ad2cp",
+        "dvl",
+        "Nortek AD2CP: bottom track (0x17), tracks of DVLs (0x1B, 0x1D), text",
+        share,
+        read,
+        "mhkit on one recording; 0x1B and 0x1D: files written after public readers that agree",
+        (".ad2cp",),
+    ),
+)

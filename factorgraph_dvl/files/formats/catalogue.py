@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
-from factorgraph_dvl.files.formats.format import Format
-from factorgraph_dvl.files.formats.normalised import (
+from factorgraph_dvl.files.formats import (
     ad2cp,
+    dvl_sentences,
     nmea,
     pd0,
+    pd4,
+    pd6,
     pixse,
-    trajectories,
-    velocity_logs,
+    rowe,
+    rtklib,
+    sbet,
+    water_linked,
 )
+from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
 from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, ulog
 
 FORMATS: tuple[Format, ...] = (
     *pd0.FORMATS,
     *ad2cp.FORMATS,
-    *velocity_logs.FORMATS,
-    *trajectories.FORMATS,
+    *pd4.FORMATS,
+    *pd6.FORMATS,
+    *dvl_sentences.FORMATS,
+    *water_linked.FORMATS,
+    *rowe.FORMATS,
+    *rtklib.FORMATS,
+    *sbet.FORMATS,
     *nmea.FORMATS,
     *pixse.FORMATS,
     nucleus.FORMAT,

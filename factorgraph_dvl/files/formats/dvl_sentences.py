@@ -9,17 +9,29 @@ beams are not verified.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.files.formats.clocks import posix
-from factorgraph_dvl.files.formats.format import positive
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, number
+from factorgraph_dvl.files.formats.format import Batch, Format, left_out, positive
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file, number
 from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.nmea import second_of_day
 from factorgraph_dvl.files.formats.sentences import NOT_USABLE, Sentence, sentences
-from factorgraph_dvl.files.formats.velocities import EARTH, INSTRUMENT, records, without
+from factorgraph_dvl.files.formats.velocities import (
+    EARTH,
+    INSTRUMENT,
+    attitude,
+    pings,
+    read_pings,
+    records,
+    share_of_records,
+    without,
+)
 from factorgraph_dvl.geometry.units import DEG
 
 Row = dict[str, object]
@@ -173,3 +185,49 @@ def _extended(sentence: Sentence, rows: list[Row], elapsed: float) -> float:
         }
     )
     return elapsed
+
+
+_MEAN_INCREMENT = "velocities are means since the ping before: stamps are shifted to the middle"
+
+
+def _read_cerulean(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    last = np.nan
+    losses = Losses()
+    for increments, extended in read_cerulean(map_file(path), losses=losses):
+        if len(increments):
+            batch = pings(increments, "own", "", "DVPDL")
+            stamps = np.concatenate([[last], increments["second"]])
+            last = float(stamps[-1])
+            steps = np.diff(stamps)
+            delay = np.where((steps > 0.0) & (steps < 10.0), -steps / 2.0, 0.0)
+            batch.records["delay"] = delay
+            yield Batch("dvl", batch.records, "own", "DVPDL", notes=(_MEAN_INCREMENT,))
+        if len(extended):
+            yield pings(extended, "own", "", "DVEXT")
+            yield from attitude(extended, "own")
+    yield left_out(losses)
+
+
+# Mean bytes of a record: what a count of records in a sample is worth.
+_SENTENCE_BYTES = 120.0
+
+FORMATS = (
+    Format(
+        "nortek",
+        "dvl",
+        "Nortek `$PNORBT0`, `1`, `6` to `9`",
+        share_of_records(read_nortek, _SENTENCE_BYTES),
+        partial(read_pings, read_nortek, "own", ""),
+        "published sentences",
+        in_text=True,
+    ),
+    Format(
+        "cerulean",
+        "dvl",
+        "Cerulean `$DVPDL`, `$DVEXT`",
+        share_of_records(read_cerulean, _SENTENCE_BYTES),
+        _read_cerulean,
+        "files written after the document",
+        in_text=True,
+    ),
+)

@@ -8,9 +8,11 @@ beam velocities in beam coordinates is not verified.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.framing import (
     Bytes,
     Index,
@@ -21,7 +23,12 @@ from factorgraph_dvl.files.formats.framing import (
     u16,
 )
 from factorgraph_dvl.files.formats.losses import Losses, count_outside, summed
-from factorgraph_dvl.files.formats.velocities import BEAM, empty
+from factorgraph_dvl.files.formats.velocities import (
+    BEAM,
+    empty,
+    read_pings,
+    share_of_records,
+)
 from factorgraph_dvl.geometry.units import DEG
 
 _SYNC = b"\x7d"
@@ -98,3 +105,19 @@ def _records(raw: Records, at: Index) -> Records:
     for name in ("pitch", "roll", "heading"):
         out[name] = np.where(is_long, raw[name] * 0.01 * DEG, np.nan)
     return out
+
+
+# Mean bytes of a record: what a count of records in a sample is worth.
+_PD4_BYTES = 47.0
+
+FORMATS = (
+    Format(
+        "pd4",
+        "dvl",
+        "Teledyne PD4, PD5",
+        share_of_records(read_pd4, _PD4_BYTES),
+        partial(read_pings, read_pd4, "day", "RFU"),
+        "files written after the manufacturer's tables",
+        (".pd4", ".pd5"),
+    ),
+)

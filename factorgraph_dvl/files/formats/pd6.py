@@ -9,14 +9,23 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
 from factorgraph_dvl.files.formats.clocks import posix
-from factorgraph_dvl.files.formats.format import positive
+from factorgraph_dvl.files.formats.format import Format, positive
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, number
 from factorgraph_dvl.files.formats.losses import Losses
-from factorgraph_dvl.files.formats.velocities import EARTH, INSTRUMENT, SHIP, VELOCITY, empty
+from factorgraph_dvl.files.formats.velocities import (
+    EARTH,
+    INSTRUMENT,
+    SHIP,
+    VELOCITY,
+    empty,
+    read_pings,
+    share_of_records,
+)
 from factorgraph_dvl.geometry.units import DEG
 
 # In the order of preference: what is nearest to the instrument.
@@ -108,3 +117,20 @@ def _rest(ping: Records, name: bytes, fields: list[bytes]) -> None:
     else:
         altitude = number(fields[3])
         ping["altitude"] = altitude if altitude > 0.0 else np.nan
+
+
+# Mean bytes of a record: what a count of records in a sample is worth.
+_PD6_BYTES = 200.0
+
+FORMATS = (
+    Format(
+        "pd6",
+        "dvl",
+        "Teledyne PD6, PD13",
+        share_of_records(read_pd6, _PD6_BYTES),
+        partial(read_pings, read_pd6, "own", "RFU"),
+        "files written after the manufacturer's tables",
+        (".pd6", ".pd13"),
+        in_text=True,
+    ),
+)

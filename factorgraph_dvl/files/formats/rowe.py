@@ -8,15 +8,27 @@ from __future__ import annotations
 
 import binascii
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.files.formats.clocks import posix
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source
+from factorgraph_dvl.files.formats.format import Batch, Format, left_out
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file
 from factorgraph_dvl.files.formats.losses import Frame, Losses, count_stretch
-from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea
-from factorgraph_dvl.files.formats.velocities import BEAM, INSTRUMENT, VELOCITY, empty, without
+from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea, sentence_batches
+from factorgraph_dvl.files.formats.velocities import (
+    BEAM,
+    INSTRUMENT,
+    VELOCITY,
+    attitude,
+    empty,
+    pings,
+    share_of_records,
+    without,
+)
 from factorgraph_dvl.geometry.units import DEG
 
 # What an ensemble begins with, its largest size, bytes, and the value of a lost beam: by
@@ -152,3 +164,31 @@ def _bottom_track(content: bytes) -> Records | None:
         ping["velocity"] = velocity[:3]
         ping["error"] = velocity[3] if beams == 4 else np.nan
     return ping
+
+
+def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    losses = Losses()
+    for velocities, nmea in read_rowe(map_file(path), losses=losses):
+        near = None
+        if len(velocities):
+            near = float(np.nanmedian(velocities["time"]))
+            yield pings(velocities, "own", "", "")
+            yield from attitude(velocities, "own")
+        yield from sentence_batches(nmea, near)
+    yield left_out(losses)
+
+
+# Mean bytes of a record: what a count of records in a sample is worth.
+_ROWE_BYTES = 3000.0
+
+FORMATS = (
+    Format(
+        "rowe",
+        "dvl",
+        "Rowe `.ens`",
+        share_of_records(read_rowe, _ROWE_BYTES),
+        _read_rowe,
+        "not verified: no document and no recording was available",
+        (".ens",),
+    ),
+)

@@ -6,13 +6,23 @@ Source: RTKLIB manual 2.4.2, appendix B.1 (positioning solution file).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.clocks import GPS_EPOCH, gps_to_utc, posix
-from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, Records, Source, lines, number
+from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out
+from factorgraph_dvl.files.formats.framing import (
+    BLOCK_OF_LINES,
+    Records,
+    Source,
+    lines,
+    map_file,
+    number,
+)
 from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.geometry.units import DEG
 
@@ -132,3 +142,43 @@ def _time(match: re.Match[bytes], system: bytes) -> float:
     if system == b"GPST":
         return float(gps_to_utc(0.0, time - GPS_EPOCH))
     return time - (_JST if system == b"JST" else 0.0)
+
+
+# Bytes of a record of RTKLIB. Chosen: about those of a line; they only share a file out.
+_LINE_BYTES = 130.0
+
+
+def _share_rtklib(path: Path, sample: bytes) -> float:
+    try:
+        count = sum(len(block) for block in read_rtklib(sample))
+    except DataError:
+        return 0.0
+    return min(count * _LINE_BYTES / len(sample), 1.0) if sample else 0.0
+
+
+def _read_rtklib(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    source = map_file(path)
+    vertical = "altitude" if is_geodetic(source) else "height"
+    losses = Losses()
+    for block in read_rtklib(source, losses=losses):
+        out = empty("fix", len(block))
+        for name in ("at", "time", "lat", "lon"):
+            out[name] = block[name]
+        out[vertical] = block["height"]
+        for name, prefix in (("std", "std_"), ("velocity", "vel_"), ("velocity_std", "vel_std_")):
+            out[name] = np.stack([block[prefix + axis] for axis in "enu"], axis=1)
+        yield Batch("fix", out, "utc", "pos")
+    yield left_out(losses)
+
+
+FORMATS = (
+    Format(
+        "rtklib",
+        "gnss",
+        "RTKLIB `.pos`",
+        _share_rtklib,
+        _read_rtklib,
+        "files written after the manual",
+        (".pos",),
+    ),
+)

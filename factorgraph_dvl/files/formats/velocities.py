@@ -1,13 +1,19 @@
-"""The record that readers of velocity logs share."""
+"""What readers of velocity logs share: their record, and pings in common terms."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.formats.format import Batch, Clock, left_out, positive
+from factorgraph_dvl.files.formats.format import empty as empty_records
+from factorgraph_dvl.files.formats.framing import Records, Source, map_file
+from factorgraph_dvl.files.formats.losses import Losses
+from factorgraph_dvl.geometry.rotations import BodyAxes
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)
 # One ping. `time`: seconds since 1970, nan if the format has none; `second`: of the day or
@@ -55,3 +61,62 @@ def records(rows: Sequence[Mapping[str, object]], axes: int = INSTRUMENT) -> Rec
 def without(values: NDArray[np.float64], sentinel: float) -> NDArray[np.float64]:
     """Return values with nan in place of a sentinel."""
     return np.where(np.abs(values - sentinel) < 1e-6, np.nan, values)
+
+
+def share_of_records(
+    reader: Callable[[Source], Iterator[Any]], size: float
+) -> Callable[[Path, bytes], float]:
+    """Return what gives the share of a sample in records of about this size, bytes."""
+
+    def share(path: Path, sample: bytes) -> float:
+        count = 0
+        for block in reader(sample):
+            parts = block if isinstance(block, tuple) else (block,)
+            count += sum(len(part) for part in parts if isinstance(part, np.ndarray))
+        return min(count * size / len(sample), 1.0) if sample else 0.0
+
+    return share
+
+
+def pings(found: Records, clock: Clock, axes: BodyAxes | Literal[""], stream: str) -> Batch:
+    """Return pings in common terms, with the time that they have."""
+    out = empty_records("dvl", len(found))
+    for name in ("at", "axes", "velocity", "error", "range", "roll", "pitch", "heading"):
+        out[name] = found[name]
+    for name in ("sound_speed", "temperature"):
+        out[name] = found[name]
+    out["beams"] = found["beam_velocity"]
+    has_time = clock in ("utc", "own") and bool(np.isfinite(found["time"]).any())
+    out["time"] = found["time"] if has_time else found["second"]
+    out["received"] = out["time"]
+    out["alignment"], out["tilts_used"] = 0.0, True
+    out["std"] = positive(found["merit"])[:, None]
+    return Batch("dvl", out, clock, stream, axes)
+
+
+def attitude(found: Records, clock: Clock) -> Iterator[Batch]:
+    """Yield the attitudes of pings in common terms, if they have headings."""
+    if not np.isfinite(found["heading"]).any():
+        return
+    out = empty_records("attitude", len(found))
+    for name in ("at", "roll", "pitch", "heading"):
+        out[name] = found[name]
+    time = found["time"] if np.isfinite(found["time"]).any() else found["second"]
+    out["time"] = out["received"] = time
+    yield Batch("attitude", out, clock, "leader")
+
+
+def read_pings(
+    reader: Callable[..., Iterator[Records]],
+    clock: Clock,
+    axes: BodyAxes | Literal[""],
+    path: Path,
+    mapping: Mapping[str, Any] | None = None,
+) -> Iterator[Batch]:
+    """Read a file of pings alone; the parameters and the result are those of `Format.read`."""
+    losses = Losses()
+    for found in reader(map_file(path), losses=losses):
+        if len(found):
+            yield pings(found, clock, axes, "")
+            yield from attitude(found, clock)
+    yield left_out(losses)

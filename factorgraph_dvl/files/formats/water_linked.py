@@ -10,15 +10,21 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from factorgraph_dvl.files.formats.format import positive
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, number
+from factorgraph_dvl.files.formats.format import Batch, Format, left_out, positive
+from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, map_file, number
 from factorgraph_dvl.files.formats.losses import Losses
-from factorgraph_dvl.files.formats.velocities import INSTRUMENT, records
+from factorgraph_dvl.files.formats.velocities import (
+    INSTRUMENT,
+    pings,
+    records,
+    share_of_records,
+)
 from factorgraph_dvl.geometry.units import DEG
 
 POSITION = np.dtype(
@@ -190,3 +196,28 @@ def _old_velocity(fields: list[bytes]) -> Row:
 def _serial_position(fields: list[bytes]) -> tuple[float, ...]:
     place = [number(field) for field in fields[:5]]
     return (*place, *(number(field) * DEG for field in fields[5:8]))
+
+
+def _read_water_linked(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
+    losses = Losses()
+    for velocities, _ in read_water_linked(map_file(path), losses=losses):
+        if len(velocities):
+            yield pings(velocities, "own", "FRD", "")
+    yield left_out(losses)
+
+
+# Mean bytes of a record: what a count of records in a sample is worth.
+_WATER_LINKED_BYTES = 60.0
+
+FORMATS = (
+    Format(
+        "water-linked",
+        "dvl",
+        "Water Linked JSON, `wrz`, `wru`, `wrp`",
+        share_of_records(read_water_linked, _WATER_LINKED_BYTES),
+        _read_water_linked,
+        "the document's examples",
+        (".json", ".jsonl"),
+        in_text=True,
+    ),
+)

@@ -12,7 +12,9 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from factorgraph_dvl.analysis.error_statistics import true_value_of
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.notation import in_words, split_unit, with_std
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
     DARK,
@@ -29,8 +31,7 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
     typeset,
 )
-from factorgraph_dvl.report.text import in_words, split_unit, with_std
-from factorgraph_dvl.solution import Estimate, Solution
+from factorgraph_dvl.solution import Solution
 
 _DIVERGING = LinearSegmentedColormap.from_list("correlation", ["#b34700", "#ffffff", ACCENT])
 

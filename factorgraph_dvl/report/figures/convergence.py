@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
 from factorgraph_dvl.analysis.convergence import Convergence
 from factorgraph_dvl.analysis.error_statistics import true_value_of
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
@@ -26,8 +29,6 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Estimate
 
 # Points of a line. Chosen: more than a panel has pixels.
 _POINTS = 2000
@@ -125,26 +126,10 @@ def convergence_figure(
         for j, n in enumerate(part):
             ax = figure.add_subplot(grid[i, j])
             c = shown[e.name] + n
-            value, sigma = values[:, c], std[:, c]
-            for k, alpha in ((3.0, 0.35), (1.0, 1.0)):
-                ax.fill_between(
-                    x, value - k * sigma, value + k * sigma, color=ACCENT_LIGHT, alpha=alpha, lw=0
-                )
-            ax.plot(x, value, color=ACCENT, lw=1.0)
-            if true_value is not None:
-                ax.axhline(float(true_value[n]), color=DARK, lw=0.9, ls="--")
+            true = np.nan if true_value is None else float(true_value[n])
+            _panel(ax, x, values[:, c], std[:, c], true)
             if np.isfinite(good_since):
                 ax.axvline(good_since - start, color=GREY, lw=0.9, ls=":")
-            # Before its sensor was heard a component has no estimate.
-            there = np.flatnonzero(np.isfinite(value))
-            tail = there[int(_SHOWN_FROM * there.size) :]
-            low = float((value - 3.0 * sigma)[tail].min())
-            high = float((value + 3.0 * sigma)[tail].max())
-            ax.set_xlim(x[0], x[-1] if x.size > 1 else x[0] + 1.0)
-            if true_value is not None:
-                low, high = min(low, float(true_value[n])), max(high, float(true_value[n]))
-            margin = 0.05 * (high - low) or 1.0
-            ax.set_ylim(low - margin, high + margin)
             name, unit = readable(e.component_names[n])
             style(ax, label if i == len(rows) - 1 else "", "")
             ax.set_title(f"{name}, {unit}" if unit else name, fontsize=NORMAL, loc="left")
@@ -172,6 +157,26 @@ def convergence_figure(
         alignment="left",
     )
     return figure
+
+
+def _panel(ax: Axes, x: Array, value: Array, sigma: Array, true: float) -> None:
+    """Draw one component over time, ±σ and ±3σ, with its truth if that is finite."""
+    for k, alpha in ((3.0, 0.35), (1.0, 1.0)):
+        ax.fill_between(
+            x, value - k * sigma, value + k * sigma, color=ACCENT_LIGHT, alpha=alpha, lw=0
+        )
+    ax.plot(x, value, color=ACCENT, lw=1.0)
+    # Before its sensor was heard a component has no estimate.
+    there = np.flatnonzero(np.isfinite(value))
+    tail = there[int(_SHOWN_FROM * there.size) :]
+    low = float((value - 3.0 * sigma)[tail].min())
+    high = float((value + 3.0 * sigma)[tail].max())
+    ax.set_xlim(x[0], x[-1] if x.size > 1 else x[0] + 1.0)
+    if np.isfinite(true):
+        ax.axhline(true, color=DARK, lw=0.9, ls="--")
+        low, high = min(low, true), max(high, true)
+    margin = 0.05 * (high - low) or 1.0
+    ax.set_ylim(low - margin, high + margin)
 
 
 def latency_figure(time: Array, latency: Array) -> Figure:

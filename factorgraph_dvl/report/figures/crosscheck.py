@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.comparison.motion_difference import (
     MotionDifference,
     joined_errors,
 )
+from factorgraph_dvl.quality.notation import split_unit, with_std
 from factorgraph_dvl.report.figures.calibration import readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
@@ -35,7 +36,6 @@ from factorgraph_dvl.report.figures.drawing import (
     typeset,
     verdict_label,
 )
-from factorgraph_dvl.report.text import split_unit, with_std
 from factorgraph_dvl.solution import Solution
 
 _RED = "#c0392b"

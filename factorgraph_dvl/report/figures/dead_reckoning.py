@@ -13,6 +13,7 @@ from factorgraph_dvl.analysis.dead_reckoning.track_error import Score
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
     DARK,
@@ -26,7 +27,6 @@ from factorgraph_dvl.report.figures.drawing import (
     style,
 )
 from factorgraph_dvl.report.figures.trajectory import mark_times
-from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.trial import Reference, Trial
 
 _BEFORE = "#c2571a"

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors, VectorErrors
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.text import fixed
-from factorgraph_dvl.sensors.verdict import Verdict
+from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.quality.verdict import Verdict
 
 # What panels stand in.
 Canvas = Figure | SubFigure

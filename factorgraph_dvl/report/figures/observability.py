@@ -23,6 +23,7 @@ from factorgraph_dvl.analysis.information.segment_singular_values import (
 )
 from factorgraph_dvl.analysis.information.shares import Shares
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.figures.calibration import heat_map, readable
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
@@ -40,7 +41,6 @@ from factorgraph_dvl.report.figures.drawing import (
     save_figures,
     style,
 )
-from factorgraph_dvl.sensors.verdict import Verdict
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 # Of what is drawn for each kind of motion; mixtures take that of their last kind.

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import SubFigure
 
+from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import (
     ACCENT,
@@ -24,7 +25,6 @@ from factorgraph_dvl.report.figures.drawing import (
     number,
     style,
 )
-from factorgraph_dvl.solution import Residuals
 
 # Points of a panel. Chosen: more only take time, and hide each other.
 _LARGEST_SCATTER = 20_000

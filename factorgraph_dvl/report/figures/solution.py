@@ -16,6 +16,7 @@ from matplotlib.gridspec import GridSpec
 from factorgraph_dvl.analysis.beam_quality import beam_quality, calibrates, calibration_of
 from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.estimates import Residuals, Trajectory
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
 from factorgraph_dvl.report.figures.calibration import calibration_figure, correlation_figure
@@ -23,7 +24,7 @@ from factorgraph_dvl.report.figures.drawing import Canvas, save_figures
 from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
-from factorgraph_dvl.solution import Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 # Draws into a part of a figure, or into a new one.
@@ -71,7 +72,36 @@ def plot(
     trial: Trial | None = None,
     axes: Axes | None = None,
 ) -> Canvas:
-    """Draw one figure of a solution; see `Solution.plot`."""
+    """Draw one of the figures that `solve` writes.
+
+    Parameters
+    ----------
+    solution : Solution
+        What to draw.
+    figure : str, default 'calibration'
+        `track`, `motion`, `calibration`, `correlation`, `error_budget`, `beam_quality`, or the
+        residuals of a sensor, such as `dvl_residuals`.
+    trial : Trial, optional
+        For its GNSS fixes, reference and true calibration, which are drawn if it is given.
+    axes : matplotlib.axes.Axes, optional
+        Axes of your own figure: the panels take their place. By default a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure or matplotlib.figure.SubFigure
+        The new figure, or the part of yours.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such figure, or nothing to draw in it.
+
+    Examples
+    --------
+    >>> import factorgraph_dvl as fd
+    >>> trial = fd.simulate("examples/short.yaml", seed=1)
+    >>> figure = fd.plot(fd.solve(trial), "track", trial=trial)
+    """
     known = drawings(solution, trial)
     if figure not in known:
         raise ConfigError(f"there is no figure {figure!r}", expected=f"one of {', '.join(known)}")

@@ -12,6 +12,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from factorgraph_dvl.analysis.error_statistics import TrajectoryErrors
+from factorgraph_dvl.estimates import Hypothesis, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
@@ -36,7 +37,6 @@ from factorgraph_dvl.report.figures.drawing import (
     new_grid,
     style,
 )
-from factorgraph_dvl.solution import Hypothesis, Trajectory
 from factorgraph_dvl.trial import Reference, Trial
 
 # Length of a close-up, s. Chosen: a period or two of a swell.

@@ -25,7 +25,7 @@ from factorgraph_dvl.analysis.error_statistics import (
     nees_band,
 )
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.text import figure_files
+from factorgraph_dvl.report.figure_files import figure_files
 from factorgraph_dvl.solution import Solution
 
 # Files of a cross-check; the first makes the folder valid.

@@ -8,11 +8,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from rich.table import Table
 
 from factorgraph_dvl.analysis.dead_reckoning.before_after import BeforeAfter, Run
 from factorgraph_dvl.analysis.dead_reckoning.track_error import Score, Stretches
-from factorgraph_dvl.report.text import figure_files, fixed
+from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.report.figure_files import figure_files
+from factorgraph_dvl.report.table import Table
 
 RESULT_FILE = "deadreckon.json"
 TRACK_FILE = "track.csv"
@@ -94,20 +95,20 @@ def _stretches(stretches: Stretches) -> dict[str, Any]:
 def error_table(result: BeforeAfter) -> Table:
     """Return a table of the errors before and after calibration."""
     table = Table(title="Dead reckoning")
-    table.add_column("error", no_wrap=True)
+    table.column("error")
     scores = [r.score for r in (result.uncalibrated, result.calibrated)]
     before, after = scores
     if before is None or after is None:
         return table
     for header in ("uncalibrated", "calibrated"):
-        table.add_column(f"{header}, m", justify="right", no_wrap=True)
-        table.add_column("%", justify="right", no_wrap=True)
+        table.column(f"{header}, m", numeric=True)
+        table.column("%", numeric=True)
 
     def metres(name: str, of: Callable[[Score], float]) -> None:
         cells = []
         for s in (before, after):
             cells += [_number(of(s)), _number(s.percent(of(s)))]
-        table.add_row(name, *cells)
+        table.row(name, *cells)
 
     metres("end point", lambda s: float(s.horizontal[-1]))
     metres("largest", lambda s: float(s.horizontal.max()))
@@ -116,18 +117,18 @@ def error_table(result: BeforeAfter) -> Table:
     metres("end point, across track", lambda s: float(s.across[-1]))
     metres("RMS, along track", lambda s: _rms(s.along))
     metres("RMS, across track", lambda s: _rms(s.across))
-    table.add_section()
+    table.end_section()
     for b, a in zip(before.stretches, after.stretches, strict=True):
         name = f"straight {a.length / 1e3:g} km"
         if a.count == 0:
-            table.add_row(f"{name}: none", "", "", "", "")
+            table.row(f"{name}: none", "", "", "", "")
             continue
         for kind in ("median", "largest"):
             cells = []
             for s in (b, a):
                 percent = getattr(s, kind)
                 cells += [_number(percent * s.length / 100.0), _number(percent)]
-            table.add_row(f"{name}, {kind} of {a.count}", *cells)
+            table.row(f"{name}, {kind} of {a.count}", *cells)
     return table
 
 

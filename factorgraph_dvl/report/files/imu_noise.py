@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from rich.table import Table
-from rich.text import Text
 
 from factorgraph_dvl.analysis.static_noise import AxisNoise, Figure, StaticNoise
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
-from factorgraph_dvl.report.text import with_std
+from factorgraph_dvl.quality.notation import with_std
+from factorgraph_dvl.report.table import Table
 
 # By definition, in SI.
 _PER_SQRT_HOUR = 1.0 / np.sqrt(HOUR)
@@ -18,10 +17,10 @@ _PER_SQRT_HOUR = 1.0 / np.sqrt(HOUR)
 
 def noise_table(noise: StaticNoise) -> Table:
     """Return a table of the figures of every axis; `<` marks what the record does not show."""
-    table = Table(title=Text(f"Static record of {noise.duration:.6g} s at {noise.rate:.4g} Hz"))
-    table.add_column("axis", no_wrap=True)
+    table = Table(title=(f"Static record of {noise.duration:.6g} s at {noise.rate:.4g} Hz"))
+    table.column("axis")
     for header in ("random walk", "bias instability", "walk of the bias"):
-        table.add_column(header, justify="right", no_wrap=True)
+        table.column(header, numeric=True)
     for name, axes, units in (
         (
             "gyro",
@@ -41,7 +40,7 @@ def noise_table(noise: StaticNoise) -> Table:
         for label, axis in zip("xyz", axes, strict=True):
             figures = (axis.white, axis.instability, axis.walk)
             cells = [_cell(f, *unit) for f, unit in zip(figures, units, strict=True)]
-            table.add_row(f"{name} {label}", *cells)
+            table.row(f"{name} {label}", *cells)
     return table
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import ORDERS, Angles, InstrumentTerms, Order
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.text import fixed
+from factorgraph_dvl.quality.notation import fixed
 
 _ORDER_TEXT: dict[Order, str] = {
     "ZYX": "intrinsic ZYX: C = Rz(yaw) Ry(pitch) Rx(roll)",

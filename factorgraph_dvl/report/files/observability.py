@@ -15,7 +15,9 @@ from factorgraph_dvl.analysis.information.observability import Observability, Se
 from factorgraph_dvl.analysis.information.segment_singular_values import OBSERVABLE, SingularValues
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.text import figure_files, split_unit
+from factorgraph_dvl.quality.notation import split_unit
+from factorgraph_dvl.quality.texts import text_of
+from factorgraph_dvl.report.figure_files import figure_files
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 FIGURES = figure_files("singular_values", "std_along_trial", "correlation", "directions", "shares")
@@ -164,7 +166,7 @@ def _marginals(m: Marginals) -> dict[str, Any]:
         },
         "correlation": {"order": m.names, "matrix": m.correlation.tolist()},
         "directions": [_direction(d) for d in m.directions],
-        "sentences": list(map(str, m.sentences)),
+        "sentences": list(map(text_of, m.sentences)),
     }
 
 

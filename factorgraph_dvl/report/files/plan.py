@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rich.table import Table
-from rich.text import Text
-
 from factorgraph_dvl.planning.proposal import Proposal
 from factorgraph_dvl.planning.requirements import Requirement
+from factorgraph_dvl.quality.notation import split_unit
 from factorgraph_dvl.report.files.observability import OWNED as OF_THE_VIEW
 from factorgraph_dvl.report.files.observability import encode
-from factorgraph_dvl.report.terminal.tables import add_column
-from factorgraph_dvl.report.text import split_unit
+from factorgraph_dvl.report.table import Cell, Mark, Table
 from factorgraph_dvl.solution import Solution
 
 # Files of the command; the first makes the folder valid.
@@ -99,21 +96,21 @@ def _proposal(p: Proposal) -> dict[str, Any]:
 def requirement_table(required: Sequence[Requirement], proposal: Proposal | None) -> Table:
     """Return a table of required against predicted σ, without and with the proposal."""
     table = Table(title="Requirements")
-    add_column(table, "component")
-    add_column(table, "unit")
-    add_column(table, "required σ", numeric=True)
-    add_column(table, "predicted σ", numeric=True)
-    add_column(table, "met")
+    table.column("component")
+    table.column("unit")
+    table.column("required σ", numeric=True)
+    table.column("predicted σ", numeric=True)
+    table.column("met")
     if proposal is not None:
-        add_column(table, "with the proposal", numeric=True)
-        add_column(table, "met")
+        table.column("with the proposal", numeric=True)
+        table.column("met")
     for i, r in enumerate(required):
         name, unit = split_unit(r.component)
-        row: list[str | Text] = [name, unit, f"{r.required:.3g}", f"{r.predicted:.3g}", _met(r)]
+        row: list[Cell] = [name, unit, f"{r.required:.3g}", f"{r.predicted:.3g}", _met(r)]
         if proposal is not None:
             after = proposal.requirements[i]
             row += [f"{after.predicted:.3g}", _met(after)]
-        table.add_row(*row)
+        table.row(*row)
     return table
 
 
@@ -141,5 +138,5 @@ def _as_yaml(manoeuvre: dict[str, Any]) -> str:
     return "{" + ", ".join(f"{key}: {value:g}" for key, value in manoeuvre.items()) + "}"
 
 
-def _met(r: Requirement) -> Text:
-    return Text("yes", "green") if r.met else Text("no", "yellow")
+def _met(r: Requirement) -> Mark:
+    return Mark("yes", "green") if r.met else Mark("no", "yellow")

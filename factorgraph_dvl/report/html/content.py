@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.finding import Finding
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.solution import Solution
 
 _FILES = re.compile(r"[^\s'\"`:;,()]+\.(?:csv|parquet|pq|yaml|yml|json|png|pd0|ens|log|txt|bin)\b")

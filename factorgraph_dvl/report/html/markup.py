@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-from factorgraph_dvl.report.html.words import chinese
-from factorgraph_dvl.sensors.message import Message, in_language
+from factorgraph_dvl.message import Message
+from factorgraph_dvl.quality.texts import chinese, component_names, text_of
+from factorgraph_dvl.report.table import Cell as DescribedCell
+from factorgraph_dvl.report.table import Component, Mark, Table
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ def both(english: str, own: str = "") -> Html:
 
 def said(message: Message | str) -> Html:
     """Return a message in English and Chinese; a text from a file as it is."""
-    return both(in_language(message, "en"), in_language(message, "zh"))
+    return both(text_of(message), text_of(message, "zh"))
 
 
 def joined(*cells: Cell, by: str = " ") -> Html:
@@ -104,6 +106,30 @@ def table(
         element("tbody", *body),
     )
     return element("div", inner, class_="scroll", role="group", tabindex="0", **labels(label))
+
+
+def described(table_: Table, *, label: str) -> Html:
+    """Return a table as it is described, with its words in both languages."""
+    numeric = [i for i, column in enumerate(table_.columns) if column.numeric]
+    rows = [list(map(_described, row)) for row in table_.rows]
+    return table([both(c.header) for c in table_.columns], rows, label=label, numeric=numeric)
+
+
+def _described(cell: DescribedCell) -> Cell:
+    if isinstance(cell, Component):
+        return component_cell(cell.name)
+    return grade_cell(cell.text) if isinstance(cell, Mark) else cell
+
+
+def component_cell(component: str) -> Html:
+    """Return the name of a component without its unit."""
+    english, own, _ = component_names(component)
+    return both(english, own)
+
+
+def grade_cell(grade: str) -> Html:
+    """Return a grade with a sign of its own, so that colour is not needed."""
+    return element("span", both(grade), class_=f"grade grade-{grade}")
 
 
 def labels(english: str) -> dict[str, str]:

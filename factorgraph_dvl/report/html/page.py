@@ -9,13 +9,18 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate
+from factorgraph_dvl.quality.notation import fixed, with_std
+from factorgraph_dvl.quality.texts import component_names
 from factorgraph_dvl.report.html.content import Result, redact
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
     Section,
     both,
+    component_cell,
     element,
+    grade_cell,
     html,
     labels,
     paragraph,
@@ -27,12 +32,10 @@ from factorgraph_dvl.report.html.sections import (
     budget_section,
     calibration_section,
     clock_section,
-    component_cell,
     crosscheck_section,
     dead_reckoning_section,
     deviation_plots,
     flat_settings,
-    grade_cell,
     halves_section,
     motion_plots,
     observability_section,
@@ -45,9 +48,6 @@ from factorgraph_dvl.report.html.sections import (
     verdict_box,
     verdict_section,
 )
-from factorgraph_dvl.report.html.words import component_names
-from factorgraph_dvl.report.text import fixed, with_std
-from factorgraph_dvl.solution import Estimate
 
 UPLOT = "vendor/uplot-1.6.32"
 # Nothing may be fetched: the page holds all it needs.

@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.texts import chinese
 from factorgraph_dvl.report.html.envelope import envelope, packed, packed_times
 from factorgraph_dvl.report.html.markup import (
     Cell,
@@ -21,7 +22,6 @@ from factorgraph_dvl.report.html.markup import (
     labels,
     table,
 )
-from factorgraph_dvl.report.html.words import chinese
 
 # Okabe and Ito's colours, which colour-blind readers distinguish; dashes for those who see none.
 _COLOURS = ("#0072b2", "#b34700", "#00694b", "#8a2f6b", "#555555", "#7a5c00")

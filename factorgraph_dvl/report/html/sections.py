@@ -11,16 +11,24 @@ from factorgraph_dvl.analysis.error_statistics import true_value_of
 from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
 from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments
 from factorgraph_dvl.analysis.information.marginals import marginals
+from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.notation import fixed, in_words, with_std
+from factorgraph_dvl.quality.texts import chinese_cause, component_names
+from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
     Section,
     both,
+    component_cell,
+    described,
     element,
     folded,
+    grade_cell,
     items,
     joined,
     paragraph,
@@ -30,16 +38,8 @@ from factorgraph_dvl.report.html.markup import (
 )
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.track import track_svg
-from factorgraph_dvl.report.html.words import (
-    chinese_cause,
-    chinese_finding,
-    component_names,
-    dictionary,
-)
-from factorgraph_dvl.report.text import at_precision, fixed, in_words, with_std
-from factorgraph_dvl.sensors.finding import Finding
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Cause, Solution
+from factorgraph_dvl.report.tables import calibration_table, posterior_table
+from factorgraph_dvl.solution import Solution
 
 # Class of each verdict in the style sheet.
 _CLASSES = {"good": "good", "doubtful": "doubtful", "do not use": "unusable"}
@@ -110,16 +110,18 @@ def verdict_box(verdict: Verdict) -> Html:
 
 def _what(finding: Finding) -> Html:
     """Return what was found."""
-    return both(str(finding), chinese_finding(finding))
+    return both(str(finding), finding.chinese)
 
 
 def _reason(finding: Finding) -> Html:
-    _, why, action = dictionary("findings")[finding.code]
+    code = finding.code
     return element(
         "div",
         paragraph(element("b", _what(finding)), Html(" "), _code(finding)),
-        paragraph(both(finding.code.why, why)),
-        paragraph(element("b", both("What to do:")), " ", both(finding.code.action, action)),
+        paragraph(both(code.why, code.text("why", "zh"))),
+        paragraph(
+            element("b", both("What to do:")), " ", both(code.action, code.text("action", "zh"))
+        ),
         class_="reason",
     )
 
@@ -128,54 +130,25 @@ def _code(finding: Finding) -> Html:
     return element("code", str(finding.code))
 
 
-def component_cell(component: str) -> Html:
-    """Return the name of a component without its unit."""
-    english, own, _ = component_names(component)
-    return both(english, own)
-
-
-def grade_cell(grade: str) -> Html:
-    """Return a grade with a sign of its own, so that colour is not needed."""
-    return element("span", both(grade), class_=f"grade grade-{grade}")
-
-
 def calibration_section(result: Result) -> Section:
     """Return every component with its prior, its grade, and the truth where that is known."""
     solution = result.solution
     truth = result.run.get("truth", {})
-    known = {e.name: true_value_of(e, truth) for e in solution.estimates} if truth else {}
-    shown = any(v is not None for v in known.values())
-    rows: list[list[Cell]] = []
-    for e in solution.estimates:
-        limit = solution.limits.get(e.name)
-        true = known.get(e.name)
-        for i, name in enumerate(e.component_names):
-            value, std = float(e.value[i]), float(e.std[i])
-            prior = float(e.prior_std[i])
-            row: list[Cell] = [
-                component_cell(name),
-                with_std(value, std) if std > 0.0 else joined(f"{value:.6g} ", both("fixed")),
-                component_names(name)[2],
-                f"{float(e.prior_value[i]):.4g} ± {prior:.3g}" if np.isfinite(prior) else "–",
-                f"{limit:g}" if limit is not None else "",
-                grade_cell(solution.grades[e.name][i]),
-            ]
-            if shown and true is not None:
-                row.append(at_precision(float(true[i]), std))
-                row.append(fixed((value - float(true[i])) / std, 2) if std > 0.0 else "–")
-            elif shown:
-                row += ["", ""]
-            rows.append(row)
-    header = ["parameter", "value ± σ", "unit", "before the trial", "limit of σ", "grade"]
-    if shown:
-        header += ["truth", "error / σ"]
+    known = {
+        name: (true, (value - true) / std if std > 0.0 else np.nan)
+        for e in solution.estimates
+        if (all_true := true_value_of(e, truth)) is not None
+        for name, value, std, true in zip(
+            e.component_names, e.value.tolist(), e.std.tolist(), all_true.tolist(), strict=True
+        )
+    }
     return section(
         "Calibration",
         paragraph(both(
             "Grades: green, σ is within its limit; orange, up to twice the limit; red, above "
             "that; grey, the data did not halve the σ known before the trial."
         )),
-        table([both(h) for h in header], rows, label="Calibration", numeric=(1, 3, 4, 6, 7)),
+        described(calibration_table(solution, known), label="Calibration"),
         *_noise(solution),
         key="calibration",
     )  # fmt: skip
@@ -329,18 +302,7 @@ def observability_section(result: Result, segments: Sequence[Segment]) -> Sectio
     cells: list[Cell] = []
     view = marginals(solution.estimates, solution.covariance, solution.limits)
     if view is not None:
-        rows = [
-            [component_cell(name), f"{prior:.3g}", f"{std:.3g}", f"{std / prior:.3f}",
-             grade_cell(grade)]
-            for name, prior, std, grade in zip(
-                view.names, view.prior_std, view.std, view.grade, strict=True
-            )
-        ]  # fmt: skip
-        header = ["parameter", "before the trial", "σ now", "σ / prior σ", "grade"]
-        numeric = (1, 2, 3)
-        cells.append(
-            table([both(h) for h in header], rows, label="Observability", numeric=numeric)
-        )
+        cells.append(described(posterior_table(view), label="Observability"))
         if view.sentences:
             cells.append(element("h3", both("Directions that the data hardly determine")))
             cells.append(items(list(map(said, view.sentences))))
@@ -578,9 +540,32 @@ def settings_section(result: Result) -> Section:
             "Settings",
             table([both("section"), both("key"), both("value")], settings, label="Settings"),
         ),
+        *_solver_steps(run.get("steps", ())),
         element("h3", both("Versions")),
         table([both("package"), both("version")], versions, label="Versions"),
         key="settings",
+    )
+
+
+def _solver_steps(steps: Sequence[Mapping[str, Any]]) -> Iterator[Html]:
+    """Yield what the solver changed of its assumptions, step by step."""
+    if not steps:
+        return
+    header = ["round", "what changed", "objective", "fall", "largest move, σ"]
+    rows = [
+        [f"{s['round']}", both(s["change"]), f"{s['objective']:.1f}", f"{s['fall']:.2f}",
+         f"{s['largest_move_sigma']:.2f}"]
+        for s in steps
+    ]  # fmt: skip
+    label = "Steps of the solver"
+    text = (
+        "The solver keeps a change of its assumptions only if it lowers the objective: "
+        "-2 log of the restricted likelihood, up to a constant."
+    )
+    yield folded(
+        label,
+        paragraph(both(text)),
+        table([both(h) for h in header], rows, label=label, numeric=(0, 2, 3, 4)),
     )
 
 

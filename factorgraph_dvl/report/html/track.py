@@ -7,10 +7,10 @@ from math import floor, log10
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.html.markup import Html, labels
-from factorgraph_dvl.solution import Trajectory
 
 # Size of the drawing and its margins, in its own units.
 _SIZE = 720.0

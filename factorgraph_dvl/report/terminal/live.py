@@ -9,10 +9,10 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from factorgraph_dvl.report.terminal.tables import VERDICT_COLOURS
-from factorgraph_dvl.report.text import at_precision, split_unit
-from factorgraph_dvl.sensors.verdict import Verdict
-from factorgraph_dvl.solution import Estimate, Trajectory
+from factorgraph_dvl.estimates import Estimate, Trajectory
+from factorgraph_dvl.quality.notation import at_precision, split_unit
+from factorgraph_dvl.quality.verdict import Verdict
+from factorgraph_dvl.report.tables import VERDICT_COLOURS
 
 
 def live_view(

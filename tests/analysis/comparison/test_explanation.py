@@ -6,8 +6,9 @@ import numpy as np
 from comparisons import estimate, lever_arm, result
 
 from factorgraph_dvl.analysis.comparison.crosscheck import crosscheck
-from factorgraph_dvl.sensors.finding import Code, Finding
-from factorgraph_dvl.solution import Solution, Trajectory
+from factorgraph_dvl.estimates import Trajectory
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.solution import Solution
 
 
 def test_explanations_come_from_the_results() -> None:

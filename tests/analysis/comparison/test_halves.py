@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from factorgraph_dvl.analysis.comparison.halves import compare_halves, halves_of
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.sensors.finding import Code
+from factorgraph_dvl.quality.finding import Code
 
 SIGMA = np.array([5.0, 5.0, 5.0, 0.1])
 TRUTH = np.array([1.0, 2.0, 3.0, 0.005])

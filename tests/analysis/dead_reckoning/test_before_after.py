@@ -24,6 +24,7 @@ from factorgraph_dvl.analysis.dead_reckoning.integration import (
 from factorgraph_dvl.analysis.dead_reckoning.track_error import score
 from factorgraph_dvl.baselines import sins
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.files.solution_folder import save_solution
 from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.geometry.earth import ECCENTRICITY_SQUARED, RATE, SEMI_MAJOR, LocalFrame
@@ -33,7 +34,6 @@ from factorgraph_dvl.imu.attitude_history import AttitudeHistory
 from factorgraph_dvl.imu.attitude_record import orientations
 from factorgraph_dvl.simulation import load_scenario, plan_motion, simulate
 from factorgraph_dvl.simulation.compass import InsTruth
-from factorgraph_dvl.solution import Trajectory
 from factorgraph_dvl.trial import Reference
 
 HALF_TURN = [

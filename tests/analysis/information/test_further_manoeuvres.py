@@ -7,8 +7,9 @@ import pytest
 from builders import build_solution
 
 from factorgraph_dvl.analysis.information.further_manoeuvres import further_manoeuvres
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.solution import Estimate, Solution
+from factorgraph_dvl.solution import Solution
 
 
 def estimate(name: str, components: tuple[str, ...], std: Array) -> Estimate:

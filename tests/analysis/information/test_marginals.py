@@ -7,7 +7,8 @@ import pytest
 from scipy.linalg import eigh
 
 from factorgraph_dvl.analysis.information.marginals import marginals
-from factorgraph_dvl.solution import Estimate
+from factorgraph_dvl.estimates import Estimate
+from factorgraph_dvl.quality.texts import text_of
 
 
 def estimate(name, components, std, prior):
@@ -52,7 +53,7 @@ def test_two_that_cannot_be_told_apart():
     assert weakest.ratio == pytest.approx(1.0, rel=1e-6)
     np.testing.assert_allclose(np.abs(weakest.vector), [np.sqrt(0.5)] * 2, rtol=1e-4)
     assert not found.observable.any()
-    (sentence,) = map(str, found.sentences)
+    (sentence,) = map(text_of, found.sentences)
     assert "a_deg and b_m cannot be separated: 100 % of the prior's σ remains" in sentence
     assert "a_deg by 1 and b_m by 0.5 change together" in sentence
     assert "only a_deg - 2 · b_m is known, to 0.01" in sentence
@@ -60,7 +61,7 @@ def test_two_that_cannot_be_told_apart():
 
 def test_one_that_is_not_told():
     found = view(np.diag([1.0, 1e-6]), [1.0, 1.0])
-    assert tuple(map(str, found.sentences)) == (
+    assert tuple(map(text_of, found.sentences)) == (
         "a_deg is not determined by the data: 100 % of the prior's σ remains",
     )
     assert [d.names for d in found.directions] == [("a_deg",), ("b_m",)]
@@ -68,7 +69,7 @@ def test_one_that_is_not_told():
 
 def test_several_that_are_not_told_are_named_one_by_one():
     found = view(np.diag([1e-6, 1.0, 1.0]), [1.0, 1.0, 1.0])
-    assert [str(s).split()[0] for s in found.sentences] == ["b_m", "c_m"]
+    assert [text_of(s).split()[0] for s in found.sentences] == ["b_m", "c_m"]
 
 
 def test_two_open_combinations_of_two_components():
@@ -78,13 +79,13 @@ def test_two_open_combinations_of_two_components():
     assert [d.ratio for d in found.directions] == pytest.approx([0.9, 0.7])
     # sqrt((0.81 + 0.49) / 2) = 0.806.
     left = "is hardly determined by the data: 81 % of the prior's σ remains"
-    assert tuple(map(str, found.sentences)) == (f"a_deg {left}", f"b_m {left}")
+    assert tuple(map(text_of, found.sentences)) == (f"a_deg {left}", f"b_m {left}")
 
 
 def test_known_but_correlated():
     P = np.array([[4.0, 1.96], [1.96, 1.0]]) * 1e-4
     found = view(P, [1.0, 1.0])
-    (sentence,) = map(str, found.sentences)
+    (sentence,) = map(text_of, found.sentences)
     # a - 1.96 b: sqrt(4 - 1.96²) cm = 0.398 cm; a alone 2 cm.
     assert "hard to separate (correlation 0.980)" in sentence
     assert "a_deg - 1.96 · b_m is known to 0.004, a_deg alone to 0.02" in sentence
@@ -92,7 +93,7 @@ def test_known_but_correlated():
 
 def test_all_is_told():
     found = view(np.diag([1e-6, 1e-6]), [1.0, 1.0])
-    assert tuple(map(str, found.sentences)) == ()
+    assert tuple(map(text_of, found.sentences)) == ()
     assert found.observable.all()
 
 

@@ -15,11 +15,16 @@ from scipy.io import loadmat, netcdf_file
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.files.exporting.arrays import write_matlab, write_netcdf, write_parquet
 from factorgraph_dvl.files.exporting.geographic import write_geojson, write_kml
-from factorgraph_dvl.files.exporting.motion import ExportedMotion, exported_motion
 from factorgraph_dvl.files.exporting.navigation import write_nmea, write_sbet
-from factorgraph_dvl.files.exporting.tum import write_tum
+from factorgraph_dvl.files.exporting.trajectories import (
+    ExportedMotion,
+    exported_motion,
+    write_matlab,
+    write_netcdf,
+    write_parquet,
+    write_tum,
+)
 from factorgraph_dvl.files.formats.clocks import gps_to_utc, utc_to_gps
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import rotation_from_rph

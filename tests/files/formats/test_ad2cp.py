@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.files.formats import ad2cp
+from factorgraph_dvl.files.formats.ad2cp import read as read_batches
 from factorgraph_dvl.files.formats.framing import map_file
-from factorgraph_dvl.files.formats.normalised.ad2cp import read as read_batches
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.settings.yaml_file import read_yaml
@@ -77,7 +77,7 @@ def test_what_was_written_is_read():
     np.testing.assert_allclose(ping["distance"], [10.5, 11.0, 12.0, np.nan])
     assert ping["time"] == pytest.approx(WHEN.timestamp(), abs=1e-6)
     assert ping["heading"] / DEG == pytest.approx(271.25)
-    assert (ping["coordinates"], ping["beams"], ping["number"]) == (ad2cp.BEAM, 4, 77)
+    assert (ping["coordinates"], ping["beams"], ping["number"]) == (ad2cp.IN_BEAMS, 4, 77)
     np.testing.assert_allclose(ping["rotation"].ravel(), ahrs[:9])
     np.testing.assert_allclose(ping["rate"], ahrs[13:] * DEG)
     assert text == ["GETBT,RANGE=30\r\nX"]
@@ -86,7 +86,7 @@ def test_what_was_written_is_read():
 def test_other_scale_and_no_orientation():
     (ping,) = read(record(scale=-3, frame=1))[0]
     np.testing.assert_allclose(ping["velocity"][:3], [1.5, -0.25, 0.0])
-    assert ping["coordinates"] == ad2cp.XYZ
+    assert ping["coordinates"] == ad2cp.IN_XYZ
     assert np.isnan(ping["rate"]).all()
 
 

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.files.formats import janus
 from factorgraph_dvl.files.formats.framing import map_file
-from factorgraph_dvl.files.formats.pd0 import EARTH, SHIP, read_pd0
+from factorgraph_dvl.files.formats.pd0 import read_pd0
+from factorgraph_dvl.files.formats.velocities import EARTH, SHIP
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 NENANA = DATA / "nenana_river" / "nenana_2010-09-23.PD0"

@@ -9,7 +9,7 @@ import pytest
 from format_samples import PIXSE
 from format_writers import nmea
 
-from factorgraph_dvl.files.formats.normalised import pixse
+from factorgraph_dvl.files.formats import pixse
 
 DEG = np.pi / 180.0
 

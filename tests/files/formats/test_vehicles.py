@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, ulog
 from factorgraph_dvl.files.formats.vehicles.library import load
@@ -50,7 +51,7 @@ def test_a_library_that_is_missing_is_named_with_its_extra(module, monkeypatch, 
     with pytest.raises(ConfigError, match="is not installed") as caught:
         list(module.read(path))
     assert f"pip install 'factorgraph-dvl[{module.FORMAT.extra}]'" in str(caught.value)
-    assert caught.value.exit_code == 2
+    assert exit_code_of(caught.value) == 2
 
 
 def test_extras_install_the_libraries():

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.report.figures.convergence import convergence_figure
-from factorgraph_dvl.solution import Estimate
 
 
 def test_the_figure_has_every_beam_also_one_that_came_late():

@@ -11,17 +11,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
+from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.verdict import verdict_of
 from factorgraph_dvl.report.figures.drawing import draw_band, save_figures
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.solution import drawings, write_figures
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
-from factorgraph_dvl.sensors.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
-from factorgraph_dvl.sensors.verdict import verdict_of
-from factorgraph_dvl.solution import Estimate, Residuals, Solution, Trajectory
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Reference, Trial
 
 TRUTH = {

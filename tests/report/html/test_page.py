@@ -16,10 +16,10 @@ from reports import build_result
 
 from factorgraph_dvl import sensors
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.texts import catalogue, chinese_cause
 from factorgraph_dvl.report.html.envelope import envelope
 from factorgraph_dvl.report.html.page import UPLOT, comparison_page, report_page
-from factorgraph_dvl.report.html.words import chinese_cause, dictionary
-from factorgraph_dvl.sensors.finding import Code
 from factorgraph_dvl.sensors.parameters import ParameterSpec
 
 # Of the files in the package `uplot` 1.6.32 as npm serves it, whose shasum is
@@ -141,19 +141,21 @@ def test_every_phrase_is_there_in_chinese() -> None:
     headings = re.findall(r"<h[23][^>]*>(.*?)</h[23]>", pages)
     names = ("by hand", "out", "b")
     assert all("zh-Hans" in h for h in headings if h not in names)
-    assert all(dictionary("phrases").values())
+    assert all(catalogue("phrases").values())
 
 
 def test_findings_and_causes_are_there_in_chinese() -> None:
-    own = dictionary("findings")
+    own = catalogue("findings")
     assert own.keys() == {str(code) for code in Code}
-    assert all(len(texts) == 3 and all(texts) for texts in own.values())
+    for texts in own.values():
+        assert texts.keys() == {"meaning", "why", "action"}
+        assert all(len(both) == 2 and all(both) for both in texts.values())
     page = report_page(build_result())
     code = Code.CLOCK_OFFSET
-    for english, chinese in zip((code.why, code.action), own[code][1:], strict=True):
+    for english, chinese in (own[code]["why"], own[code]["action"]):
         assert f'<span lang="en">{english}</span>' in page
         assert f'<span lang="zh-Hans">{chinese}</span>' in page
-    assert f"{own[code][0]}（GNSS: gnss.csv of by hand is 0.2 s late）" in page
+    assert f"{own[code]['meaning'][1]}（GNSS: gnss.csv of by hand is 0.2 s late）" in page
     assert "IMU 噪声（0.1 deg/√h）" in page
     assert chinese_cause("noise of DVL velocity") == "DVL 速度噪声"
     assert chinese_cause("prior of lever_arm_m") == "杆臂的先验"
@@ -161,7 +163,7 @@ def test_findings_and_causes_are_there_in_chinese() -> None:
 
 
 def test_parameters_are_there_in_chinese() -> None:
-    known = dictionary("parameters")
+    known = catalogue("parameters")
     specs = {
         spec.stem
         for module in iter_modules(sensors.__path__)

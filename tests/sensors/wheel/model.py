@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from factorgraph_dvl.sensors.wheel import Wheel, WheelSettings
@@ -10,12 +10,9 @@ from factorgraph_dvl.sensors.wheel import Wheel, WheelSettings
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.protocol import SensorSection
-from factorgraph_dvl.simulation.instruments import SimulatedInstrument
+from factorgraph_dvl.simulation.instruments import ScenarioView, SimulatedInstrument
 from factorgraph_dvl.simulation.measurements import sample_times
 from factorgraph_dvl.simulation.motion import TrueMotion
-
-if TYPE_CHECKING:
-    from factorgraph_dvl.simulation.scenario import Scenario
 
 
 class WheelTruth(SimulatedInstrument, frozen=True, kw_only=True):
@@ -32,7 +29,7 @@ class WheelTruth(SimulatedInstrument, frozen=True, kw_only=True):
 
 
 def simulate_wheel(
-    scenario: Scenario, motion: TrueMotion, rng: np.random.Generator
+    scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
 ) -> tuple[Wheel, dict[str, Array]]:
     """Return the wheel's record and its scale error."""
     truth: WheelTruth = scenario.wheel

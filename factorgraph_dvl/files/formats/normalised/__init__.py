@@ -1,1 +1,0 @@
-"""Records of the readers in the common terms of `format`."""

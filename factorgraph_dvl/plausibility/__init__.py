@@ -1,0 +1,1 @@
+"""What is wrong with the records of a trial, before it is solved."""

@@ -1,0 +1,385 @@
+"""Steps of the solver: each proposes other assumptions, of which the objective keeps the better.
+
+A step has a name and one method. It proposes models in the order in which they are tried; those
+after the first are nearer to the present one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.results import DO_NOT_FIT
+from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.bias_walks import bias_walks
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
+from factorgraph_dvl.solvers.correlated_noise import (
+    correlated_noise,
+    long_run_share,
+    noise_of,
+    with_innovations,
+    with_others,
+)
+from factorgraph_dvl.solvers.known_parameters import Explanation, explanation
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.model import Estimated, Model
+from factorgraph_dvl.solvers.motion_strengths import Strengths
+from factorgraph_dvl.solvers.outliers import robust_weights
+from factorgraph_dvl.solvers.preparation import Preparation
+from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.statistics.variance_components import (
+    VarianceComponents,
+    variance_components,
+)
+
+# Shares of a change of noise that are tried in turn. Chosen: what is left changes no σ.
+_SHARES = (1.0, 0.5, 0.25, 0.125)
+# Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
+# the model is wrong.
+_MOST_FREED = 2
+# Relative change of the noise over a long time, by that of innovations, from which on it counts.
+# Chosen: less changes no σ that is shown.
+_SAME_INNOVATIONS = 0.05
+# Variance of the scores, beside that of white noise, that a change may leave to explain what looks
+# like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
+_MOST_SCATTER = 20.0
+# Searches for gross errors. Chosen: the second finds those that the first could not see.
+_SEARCHES = 2
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """Assumptions to try, and where their minimisation starts.
+
+    Parameters
+    ----------
+    model : Model
+        What is assumed.
+    states, values : object and dict of str to ndarray
+        Of the nodes, and all parameters.
+    rough : bool, default False
+        Whether the minimisation may end early, as another one follows.
+    """
+
+    model: Model
+    states: Any
+    values: dict[str, Array]
+    rough: bool = False
+
+
+class Step(Protocol):
+    """What may change of a model."""
+
+    @property
+    def name(self) -> str:
+        """What changes, for the record of steps."""
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what to try from a minimum on, until one of them lowers the objective."""
+
+
+def _from(at: Estimated, **changes: Any) -> Proposal:
+    """Return a proposal that starts where a minimum is."""
+    return Proposal(replace(at.model, **changes), at.states, at.values)
+
+
+@dataclass
+class MotionStrengths:
+    """Strengths of a motion's prior, of processes and of white noise, by their likelihood."""
+
+    name = "strengths of motion and noise"
+    _last: Strengths | None = None
+    _settled_for: tuple[Any, ...] | None = None
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield strengths that the residuals ask for, and others on the way there."""
+        model = at.model
+        # What other assumptions made of the noise is to be found anew.
+        own = model.parameters, model.robust_weights, _labels(model)
+        if _are_those(own, self._settled_for):
+            return
+        found = model.prepared.strengths(at.problem, at.minimum, self._last)
+        if found is None:
+            self._settled_for = own
+            return
+        self._last = found
+        if found.same:
+            self._settled_for, self._last = own, None
+        for share in _SHARES:
+            yield _with_strengths(model, found, share)
+
+
+def _with_strengths(model: Model, found: Strengths, share: float) -> Proposal:
+    """Return a model part of the way to other strengths, in logarithms."""
+    before = model.chain
+    assert isinstance(before, SmoothChain)
+    density = before.density ** (1.0 - share) * found.chain.density**share
+    changed = replace(
+        model,
+        chain=replace(found.chain, density=density),
+        processes=tuple(
+            _between(p, q, share) for p, q in zip(model.processes, found.processes, strict=True)
+        ),
+        noise_factors=_part_of(model.noise_factors, found.factors, share),
+        tilt=found.tilt,
+    )
+    return Proposal(changed, found.states, found.values, rough=not found.same)
+
+
+class States:
+    """States and constants: a minimisation that ended early goes on."""
+
+    name = "states and constants"
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the same model where its minimum is not reached."""
+        if at.rough or not at.minimum.converged:
+            yield Proposal(at.model, at.states, at.values)
+
+
+class Gates:
+    """Measurements that may be none at all, as ranges of echoes: which of them are left out."""
+
+    name = "echoes"
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what leaves out all beyond the gates of their sensors."""
+        found: Mapping[str, Array] = at.problem.outliers(at.minimum.evaluation)
+        if not _same(found, at.model.rejected):
+            yield _from(at, rejected=found)
+
+
+@dataclass
+class GrossErrors:
+    """Gross errors, by graduated truncation."""
+
+    name = "gross errors"
+    _searched: int = 0
+    _for: tuple[Any, ...] | None = None
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the gross errors that are found where all measurements count."""
+        model, problem = at.model, at.problem
+        own = model.parameters, model.prepared, _labels(model)
+        if not _are_those(own, self._for):
+            self._for, self._searched = own, 0
+        if self._searched >= _SEARCHES:
+            return
+        self._searched += 1
+        evaluation = at.minimum.evaluation
+        if model.robust_weights and self._searched == 1:
+            problem.robust_weights = {}
+            problem.weigh(evaluation)
+        found = robust_weights(problem, evaluation)
+        if found is None:
+            if model.robust_weights and self._searched == 1:
+                yield _from(at, robust_weights={})
+            return
+        weights, there = found
+        if not _same(weights, model.robust_weights):
+            changed = replace(model, robust_weights=weights)
+            yield Proposal(changed, there.states, there.parameters)
+
+
+@dataclass
+class Correlation:
+    """Noise that persists: processes, or wide white noise where it lasts for seconds."""
+
+    name = "correlation of noise"
+    _for: tuple[Any, ...] | None = None
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the correlated noise that residuals show."""
+        model, problem, minimum = at.model, at.problem, at.minimum
+        own = model.parameters, model.prepared
+        if _are_those(own, self._for) or not minimum.converged:
+            return
+        self._for = own
+        found = correlated_noise(problem, minimum.evaluation, set(model.noise_factors))
+        if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
+            # Noise that persists would take the place of what changed.
+            found = correlated_noise(problem, minimum.evaluation, ())
+        known = {p.label for p in model.processes}
+        if not (found.long_run or {p.label for p in found.processes} - known):
+            return
+        persists = any(p.label in model.robust_weights for p in found.processes)
+        yield _from(
+            at,
+            processes=with_others(model.processes, found.processes),
+            noise_factors={**model.noise_factors, **found.factors},
+            long_run=found.long_run,
+            gain=found.long_run_gain,
+            # What wanders for long is no outlier.
+            robust_weights={} if persists else model.robust_weights,
+        )
+
+
+@dataclass
+class KnownParameters:
+    """Parameters that are stated as known, but that the data say have another value."""
+
+    name = "a parameter that was stated"
+    freed: list[Explanation] = field(default_factory=list)
+    left: Explanation | None = None
+    _tested: tuple[Any, ...] | None = None
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what estimates the most probable of these, with noise as stated and as found."""
+        model, minimum = at.model, at.minimum
+        if not minimum.converged or model.parameters is self._tested:
+            return
+        self._tested = model.parameters
+        # The test has a problem of its own, and more columns.
+        at.problem.release()
+        found = explanation(at.problem, minimum, model.prepared.trial.imu)
+        self.left = found
+        if found is None or len(self.freed) >= _MOST_FREED:
+            return
+        self.freed.append(found)
+        self.left = None
+        parameters = tuple(
+            found.freed if p.name == found.parameter.name else p for p in model.parameters
+        )
+        tilt = model.tilt
+        if tilt is not None:
+            tilt = tilt.of(at.problem.parameters, tuple(p for p in parameters if p.estimated))
+        # What the misfit made of noise and gross errors is to be found anew.
+        stated = replace(model.as_stated(), parameters=parameters, tilt=tilt)
+        yield Proposal(stated, at.states, at.values)
+        yield _from(at, parameters=parameters, tilt=tilt)
+        # It did not explain enough.
+        self.freed.pop()
+
+
+class Noise:
+    """Factors on stated noise, and strengths of correlated noise, by restricted likelihood."""
+
+    name = "noise"
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what residuals ask for, then part of it."""
+        model, problem, minimum = at.model, at.problem, at.minimum
+        if not model.noise_factors or not minimum.converged or problem.chain.interpolates:
+            return
+        found = variance_components(problem, minimum.evaluation, minimum.information)
+        before = model.noise_factors
+        factors = dict(before) | {
+            label: f.after(before[label]) for label, f in found.white.items()
+        }
+        processes = tuple(
+            with_innovations(p, found.correlated[p.label].factor)
+            if p.density_only and p.label in found.correlated and _counts(problem, found, p)
+            else p
+            for p in refitted(problem, minimum.evaluation)
+        )
+        for share in _SHARES:
+            changed = _part_of(before, factors, share)
+            part = tuple(
+                _between(p, q, share) for p, q in zip(model.processes, processes, strict=True)
+            )
+            if _same(changed, before) and _are_those(part, model.processes):
+                return
+            yield _from(at, noise_factors=changed, processes=part)
+
+
+@dataclass
+class Walks:
+    """Biases of the IMU that walk more than stated."""
+
+    name = "walks of biases"
+    report: Progress
+    known: KnownParameters
+    findings: tuple[Finding, ...] = ()
+    _tried: bool = False
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield walks where a sensor does not fit at all, and nothing else explains it."""
+        model, prepared = at.model, at.model.prepared
+        if (
+            self._tried
+            or not isinstance(prepared, Preparation)
+            or self.known.left is not None
+            or self.known.freed
+            or not _misfit(at.problem)
+        ):
+            return
+        self._tried = True
+        stated = {label: np.ones(f.size) for label, f in model.noise_factors.items()}
+        found = bias_walks(prepared, at.problem, at.minimum, stated, self.report)
+        if found is None:
+            return
+        there = found.evaluation
+        chain = found.prepared.chain(there.states)
+        reference = there.states, there.parameters
+        self.findings = found.findings
+        yield Proposal(
+            replace(model.as_stated(), prepared=found.prepared, chain=chain, reference=reference),
+            *reference,
+        )
+        self.findings = ()
+
+
+def _labels(model: Model) -> str:
+    """Return which noise persists."""
+    return ", ".join(p.label for p in model.processes)
+
+
+def _are_those(some: tuple[Any, ...], others: tuple[Any, ...] | None) -> bool:
+    """Whether objects are the same, and not only equal; texts, if they are equal."""
+    return others is not None and all(
+        a is b or (isinstance(a, str) and a == b) for a, b in zip(some, others, strict=True)
+    )
+
+
+def _part_of(
+    before: Mapping[str, Array], after: Mapping[str, Array], share: float
+) -> dict[str, Array]:
+    """Return factors part of the way to others, in logarithms."""
+    return {label: before[label] ** (1.0 - share) * after[label] ** share for label in before}
+
+
+def _between(before: Process, after: Process, share: float) -> Process:
+    """Return a process part of the way to another one, in logarithms."""
+    if after is before or share == 1.0:
+        return after
+    active = before.sigma > 0.0
+    ratio = np.divide(after.sigma, before.sigma, out=np.ones(active.size), where=active)
+    return replace(
+        before,
+        sigma=before.sigma * ratio**share,
+        tau=before.tau * (after.tau / before.tau) ** share,
+    )
+
+
+def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
+    """Whether a parameter that changed along the trial explains more than correlated noise."""
+    information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
+    tests = component_changes(problem, minimum.evaluation, information)
+    found = [t.change for t in tests if t.change.chi2 > CHANGED**2]
+    if not found:
+        return False
+    most = max(found, key=lambda c: c.fall)
+    return max(c.chi2 for c in found) > gain or gain < most.fall < _MOST_SCATTER * most.chi2
+
+
+def _misfit(problem: Problem) -> bool:
+    """Whether the noise of a sensor is far more than anyone would state."""
+    return any(np.max(noise.factor) > DO_NOT_FIT for noise in noise_of(problem))
+
+
+def _counts(problem: Problem, found: VarianceComponents, process: Process) -> bool:
+    """Whether other innovations change the noise over a long time."""
+    change = np.log(found.correlated[process.label].factor)
+    return bool(np.abs(long_run_share(problem, process) * change).max() > _SAME_INNOVATIONS)
+
+
+def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
