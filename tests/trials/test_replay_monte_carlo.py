@@ -103,7 +103,9 @@ def one(job):
         P = u.calibration.covariance[:DVL, :DVL]
         nees.append(error @ np.linalg.solve(P, error))
         errors = motion_errors(u.state, trial.reference)
-        motion.append([v.nees[0] for v in (errors.position, errors.velocity, errors.attitude)])
+        # By the IMU's clock a state may lie where the reference has no epochs around it.
+        kinds = (errors.position, errors.velocity, errors.attitude)
+        motion.append([v.nees[0] if v.nees.size else np.nan for v in kinds])
     batch = solve(trial if name in RATE else replace(trial, noise="stated"))
     value = np.concatenate([e.value for e in batch.estimates])
     last = np.concatenate([e.value for e in updates[-1].calibration.estimates])
@@ -134,8 +136,9 @@ def test_the_calibration_is_as_good_as_stated_all_along(runs):
 
 
 def test_the_motion_is_as_good_as_stated_all_along(runs):
-    low, high = nees_band(3, len(runs), 1.0 - _RARE)
-    mean = np.mean([r.motion for r in runs], axis=0)
+    motion = np.array([r.motion for r in runs])
+    low, high = nees_band(3, int(np.isfinite(motion).sum(axis=0).min()), 1.0 - _RARE)
+    mean = np.nanmean(motion, axis=0)
     # What persists for long keeps the deviation that is stated: positions may be better than σ.
     low = np.array([0.0 if runs[0].name in RATE else low, low, low])
     assert np.all((mean > low) & (mean < high)), mean
