@@ -16,10 +16,10 @@ import numpy as np
 
 from factorgraph_dvl.baselines.single_beacon import run_filter
 from factorgraph_dvl.geometry.vectors import interpolate
-from factorgraph_dvl.ranging.hypotheses import follow
-from factorgraph_dvl.ranging.planar_solution import solve_planar
-from factorgraph_dvl.ranging.problem import planar_setup
 from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.hypotheses import follow
+from factorgraph_dvl.solvers.planar_setup import planar_setup
 from factorgraph_dvl.trial import Trial
 
 PAGE = "chen-2021.md"
@@ -118,16 +118,17 @@ def settled(error: np.ndarray, threshold: float = THRESHOLD) -> float:
 
 def replay(trial: Trial) -> tuple[np.ndarray, np.ndarray]:
     """Return times and positions of the heaviest hypothesis, with the data so far."""
-    problem = planar_setup(trial).problem
-    nodes = list(range(EVERY + 1, problem.time.size + 1, EVERY))
+    setup = planar_setup(trial, trial.frame())
+    node_time = setup.chain.node_time
+    nodes = list(range(EVERY + 1, node_time.size + 1, EVERY))
     times, positions = [], []
 
     def keep(count: int, living: list) -> None:
         if living:
-            times.append(problem.time[count - 1])
-            positions.append(living[0].fit.p[-1].copy())
+            times.append(node_time[count - 1])
+            positions.append(living[0].fit.x[-1, :2].copy())
 
-    follow(problem, nodes, nodes[2 :: len(nodes) // 8], keep)
+    follow(setup, nodes, nodes[2 :: len(nodes) // 8], keep)
     return np.array(times), np.array(positions)
 
 
@@ -173,7 +174,7 @@ def solved(task: tuple[str, int]) -> Solved:
     current = np.random.default_rng([seed, 10]).normal(0.0, CURRENT_STD, 2)
     trial = simulate(scenario(geometry, current=current, **changes), seed)
     clean = simulate(scenario(geometry, current=current), seed)
-    solution = solve_planar(trial, rate_hz=1.0)
+    solution = solve(trial, rate_hz=1.0)
     t = solution.trajectory
     error = trial.frame().position(*t.geodetic.T)[:, :2] - truth(trial, t.time)
     std = t.position_std[:, :2]

@@ -34,7 +34,7 @@ CAPABILITIES = (
         "sensors: settings, records, residuals",
         "sensors/* beam_geometry gains turning",
         "sensors/*",
-        "sensors/ins sensors/attitude sensors/imu_grades sensors/fingerprint sensors/clock",
+        "sensors/ins sensors/attitude sensors/fingerprint sensors/clock",
     ),
     (
         "IMU: increments, preintegration, motion at any time",

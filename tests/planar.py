@@ -9,6 +9,7 @@ from truth import merged
 
 from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.planar_setup import planar_setup
 
 BASE = {
     "name": "test",
@@ -65,10 +66,28 @@ def truth(t, time):
     return t.frame().position(*interpolate(time, r.time, r.geodetic).T)[:, :2]
 
 
-def true_state(t, problem):
-    p = truth(t, problem.time)
-    parts = [t.calibration_truth[c.name] * c.si for c in problem.constants]
-    return np.column_stack([p, np.zeros_like(p)]), np.concatenate(parts)
+def setup_of(t):
+    return planar_setup(t, t.frame())
+
+
+def true_state(t, setup):
+    """Return true states of the nodes (K, 4) and constants by name."""
+    time, h = setup.chain.node_time, 0.01
+    p = truth(t, time)
+    inside = np.clip(time, time[0] + h, time[-1] - h)
+    v = (truth(t, inside + h) - truth(t, inside - h)) / (2.0 * h)
+    values = {
+        q.name: t.calibration_truth[q.name] * q.si if q.name in t.calibration_truth else q.mean
+        for q in setup.parameters
+    }
+    return np.hstack([p, v]), values
+
+
+def evaluation_of(t, setup, x, values):
+    """Return the problem of the first nodes, weighed, and its evaluation at a state."""
+    problem = setup.problem(len(x), {})
+    states = setup.chain.with_recorded(problem.chain.node_time, x)
+    return problem, problem.weighed(problem.evaluate(problem.values(states, values)))
 
 
 def error_of(t, solution):

@@ -46,7 +46,7 @@ def build_result(seconds: float = 600.0, **changes: Any) -> Result:
             *own.findings,
             Finding(Code.CLOCK_OFFSET, "gnss.csv of by hand is 0.2 s late", "GNSS"),
         ),
-        error_budget=(Cause("IMU noise", "0.1 deg/√h", adds), Cause("DVL noise", "", adds)),
+        error_budget=(Cause("gyro noise", "0.1 deg/√h", adds), Cause("DVL noise", "", adds)),
     )
     run = {
         "versions": {"python": "3.11.0"},

@@ -85,7 +85,9 @@ ELSEWHERE = {
     "simulation/*": "simulation/test_measurements.py",
     "solvers/change_along_trial": "solvers",
     "solvers/heading_and_misalignment": "solvers/test_preparation_without_imu.py",
+    "solvers/model": "solvers/test_rounds.py",
     "solvers/prediction": "planning/test_prediction.py",
+    "solvers/steps": "solvers/test_rounds.py",
     "solvers/true_times": "solvers/test_preparation_without_imu.py",
 }
 MODULES = sorted(

@@ -67,7 +67,7 @@ def _sizes(trial_path: Path) -> tuple[int, int]:
 # Function of each command within this subpackage, and what a list of commands says of it.
 COMMANDS = {
     "demo": (
-        "demo.demo",
+        "simulate.demo",
         "Simulate a trial, calibrate its DVL, and open the page of the result.",
     ),
     "simulate": ("simulate.simulate", "Simulate a trial with known truth."),

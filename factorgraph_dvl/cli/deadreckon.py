@@ -81,16 +81,10 @@ def deadreckon(
     from factorgraph_dvl.files.trial_folder import inputs_of, load_trial
     from factorgraph_dvl.plausibility.survey import explained
     from factorgraph_dvl.quality.verdict import verdict_of
-    from factorgraph_dvl.report.files.dead_reckoning import (
-        OWNED,
-        RESULT_FILE,
-        TRACK_FILE,
-        UNCALIBRATED_FILE,
-        to_json,
-    )
+    from factorgraph_dvl.report.files import dead_reckoning as files
 
     read = (*inputs_of(trial_path), calibration, None if attitude is None else Path(attitude))
-    claim_output(out, force=force, owned=OWNED, inputs=read)
+    claim_output(out, force=force, owned=files.OWNED, inputs=read)
     with ProgressLine(quiet=quiet) as progress:
         trial = load_trial(trial_path, anyway=anyway)
         values = read_calibration_values(calibration, trial.body_axes, anyway=anyway)
@@ -103,8 +97,11 @@ def deadreckon(
             progress("dead reckoning")
             result = before_after(trial, values, source)
         progress("write")
-        with new_folder(out, force=force, owned=OWNED) as folder:
-            tracks = {TRACK_FILE: result.calibrated, UNCALIBRATED_FILE: result.uncalibrated}
+        with new_folder(out, force=force, owned=files.OWNED) as folder:
+            tracks = {
+                files.TRACK_FILE: result.calibrated,
+                files.UNCALIBRATED_FILE: result.uncalibrated,
+            }
             for name, run in tracks.items():
                 write_table(folder / name, motion_columns(run.track.motion))
             if not no_figures:
@@ -118,7 +115,7 @@ def deadreckon(
                 "align_s": align,
                 "errors": list(map(str, errors)),
             }
-            (folder / RESULT_FILE).write_bytes(to_json(result, about))
+            (folder / files.RESULT_FILE).write_bytes(files.to_json(result, about))
     _print_errors(result)
     _say(trial, result, (*errors, *trial.notes, *findings))
     print_written(out)

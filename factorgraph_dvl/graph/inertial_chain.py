@@ -51,7 +51,8 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 from factorgraph_dvl.trial import Trial
 
-IMU_NOISE = "IMU noise"
+GYRO_NOISE = "gyro noise"
+ACCEL_NOISE = "accelerometer noise"
 FIRST_STATE = "prior of the first state"
 GAP = "motion while the IMU is silent"
 WALK = "random walk of {}"
@@ -145,8 +146,14 @@ class InertialChain:
 
     @property
     def log_determinant(self) -> float:
-        """Log det of the covariance of the steps of walking biases."""
-        return 2.0 * float(np.log(self.bias_steps).sum()) if self.walking else 0.0
+        """Log det of the covariances of the IMU's noise and of the steps of walking biases.
+
+        Up to what no factor on the noise of gyros or accelerometers changes.
+        """
+        imu = self.imu
+        noise = np.log([imu.gyro_noise_deg_sqrt_h, imu.accel_noise_ug_sqrt_hz])
+        walks = float(np.log(self.bias_steps).sum()) if self.walking else 0.0
+        return 2.0 * (self.count * float(noise @ [3.0, 6.0]) + walks)
 
     @property
     def middle(self) -> float:
@@ -337,7 +344,8 @@ class InertialChain:
         """
         gyro, accel = (p.name for p in self.biases)
         if letters.startswith("xxb"):
-            return {IMU_NOISE: slice(None)}
+            # Whitened, the attitude comes first, and given the rest it is known by the gyros.
+            return {GYRO_NOISE: slice(0, 3), ACCEL_NOISE: slice(3, 9)}
         if letters == "bb" or (letters == "b" and self.biases[0].joint is None):
             source = WALK if letters == "bb" else PRIOR
             return {source.format(accel): slice(0, 3), source.format(gyro): slice(3, 6)}
@@ -350,8 +358,8 @@ class InertialChain:
         imu = self.imu
         gyro, accel = self.biases
         return {
-            IMU_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h, "
-            f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz",
+            GYRO_NOISE: f"{imu.gyro_noise_deg_sqrt_h:.3g} deg/√h",
+            ACCEL_NOISE: f"{imu.accel_noise_ug_sqrt_hz:.3g} µg/√Hz",
             WALK.format(gyro.name): f"{imu.gyro_bias_walk_deg_h_sqrt_h:.3g} deg/h/√h",
             WALK.format(accel.name): f"{imu.accel_bias_walk_ug_sqrt_h:.3g} µg/√h",
         }

@@ -456,16 +456,18 @@ class Problem:
         """Return the times of measurements that miss by more than their gate, by label.
 
         A sensor whose measurements may be none at all, as the range of an echo, has a `gate`
-        in standard deviations; others have none.
+        in standard deviations as stated; others have none.
         """
         out = {}
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+        for bound, motion, sigma in zip(
+            self._bound, evaluation.motions, self.sigma(evaluation, {}), strict=True
+        ):
             o = bound.observation
             if o.gate is None:
                 continue
             before = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
             miss = self.residual(o, motion, evaluation.parameters)
-            far = np.abs(miss) > o.gate * o.sigma(motion, evaluation.parameters)
+            far = np.abs(miss) > o.gate * sigma
             times = o.time[(before | (bound.weight > 0.0).any(axis=1)) & far.any(axis=1)]
             if times.size:
                 out[o.label] = times

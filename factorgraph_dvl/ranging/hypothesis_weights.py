@@ -8,8 +8,6 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.ranging.model import PlanarProblem
-from factorgraph_dvl.ranging.smoother import Fit, cost_terms
 
 # Chosen: relative cost at which a hypothesis is dropped, a likelihood of e^-20.
 NEGLIGIBLE = 20.0
@@ -20,18 +18,22 @@ _SEVERAL = 3
 _CHANCE = 2.0
 
 
-def hypothesis_costs(problem: PlanarProblem, fits: Sequence[Fit]) -> Array:
-    """Return the costs of fits of the same data relative to the best, (F,).
+def hypothesis_costs(data: Sequence[Array], priors: Sequence[float]) -> Array:
+    """Return the costs of tracks by the same data relative to the best, (F,).
 
     Those of the data by `significant_costs`; those of the priors as they are, since few terms
     do not add up by chance.
+
+    Parameters
+    ----------
+    data : sequence of ndarray
+        Of each track, the terms (T,) of its cost.
+    priors : sequence of float
+        Of each track, the cost by all priors.
     """
-    if not fits:
+    if not data:
         return np.empty(0)
-    single = [cost_terms(problem, f) for f in fits]
-    priors = problem.prior_sigma.size + 1
-    against = significant_costs([terms[:-priors] for terms in single])
-    against = against + np.array([terms[-priors:].sum() for terms in single])
+    against = significant_costs(data) + np.array(priors)
     return np.asarray(against - against.min())
 
 

@@ -8,14 +8,16 @@ bearings all around the beacon are tried too.
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterator
+from dataclasses import dataclass
 
-from factorgraph_dvl.geometry.rotations import wrapped
-from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.ranging.hypothesis_weights import NEGLIGIBLE, hypothesis_costs
-from factorgraph_dvl.ranging.model import GATE, PlanarProblem
-from factorgraph_dvl.ranging.smoother import Fit, covariance, fit, truncation_weights
+import numpy as np
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
+from factorgraph_dvl.geometry.vectors import Array, IntArray, interpolate
+from factorgraph_dvl.ranging.dead_reckoning import DeadReckoning
+from factorgraph_dvl.sensors.beacon import GATE
 
 # Chosen: rows that the coarse search uses, and rows of them whose range rate gives starts.
 _SEARCHED = 120
@@ -26,82 +28,81 @@ _BEARINGS = 24
 _STEPS = 40
 # Chosen: least rows to fit; a start has four unknowns.
 _LEAST_ROWS = 6
+# Chosen: cost over the lowest from which on a start is not followed, a likelihood of e^-60.
+_FOLLOWED = 60.0
+# Chosen: standard deviation by which any velocity between the records may miss, m/s.
+_LEAST_RATE_STD = 1e-3
 
 
-def search(problem: PlanarProblem, nodes: int) -> list[Fit]:
-    """Return the distinct tracks that fit the first nodes, without knowing where they begin.
+@dataclass(frozen=True)
+class RangingRows:
+    """Ranges and range rates at times of a dead-reckoned track, and what they are compared with.
 
-    Only start and current are searched for, on some of the rows, for all starts at once;
-    what is found is then fitted with everything.
+    Parameters
+    ----------
+    time : ndarray, shape (M,), s
+        Of the measurements.
+    moved, velocity : ndarray, shape (M, 2) or (M, 3)
+        Displacement since the start, m, and velocity of the transponder, m/s, dead-reckoned.
+    place : ndarray, shape (M, 2), m
+        Stated position of the beacon less the lever arm, east and north.
+    above : ndarray, shape (M,), m
+        Height of the transponder over the beacon.
+    range, rate : ndarray, shape (M,)
+        As measured, m, m/s; nan where not.
+    range_std, rate_std : ndarray, shape (M,)
+        Standard deviations with the noise of dead reckoning.
+    since : ndarray, shape (M,), s
+        Since the start of the track.
     """
-    total = problem.rows(nodes)
-    if total < _LEAST_ROWS:
-        return []
-    rows = np.unique(np.linspace(0, total - 1, _SEARCHED).astype(int))
-    coarse = _CoarseSearch(problem, rows)
-    x = coarse.descend(coarse.starts())
-    cost = coarse.cost(x)
-    found: list[Fit] = []
-    tried: list[Array] = []
-    for i in np.argsort(cost):
-        if cost[i] > cost.min() + 3.0 * NEGLIGIBLE:
-            break
-        start = x[i, :2]
-        if any(np.hypot(*(start - other)) < 1.0 for other in tried):
-            continue
-        tried.append(start)
-        theta = np.zeros(problem.prior_sigma.size)
-        if "current" in problem.columns:
-            theta[problem.columns["current"]] = x[i, 2:]
-        first = np.concatenate([start, np.zeros(2)])[None]
-        hypothesis = fit(
-            problem, problem.carried(first, theta, nodes), theta, graduated=True, iterations=60
+
+    time: Array
+    moved: Array
+    velocity: Array
+    place: Array
+    above: Array
+    range: Array
+    rate: Array
+    range_std: Array
+    rate_std: Array
+    since: Array
+
+    def some(self, index: IntArray) -> RangingRows:
+        """Return some of the rows."""
+        return RangingRows(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+    def residuals(self, x: Array) -> tuple[Array, Array]:
+        """Return whitened residuals (S, 2 M), 0 where none, and Jacobians (S, 2 M, 2 or 4).
+
+        Parameters
+        ----------
+        x : ndarray, shape (S, 2) or (S, 4)
+            First positions, m, and currents, m/s, if there are any.
+        """
+        drifts = x.shape[1] == 4
+        current = x[:, 2:] if drifts else np.zeros((x.shape[0], 2))
+        p = x[:, None, :2] + self.moved + current[:, None] * self.since[:, None]
+        flat = p - self.place
+        distance = np.maximum(np.sqrt(np.sum(flat**2, axis=2) + self.above**2), 1e-3)
+        velocity = self.velocity[:, :2] + current[:, None]
+        speed = (np.sum(flat * velocity, axis=2) + self.above * self.velocity[:, 2]) / distance
+        u = flat / distance[..., None]
+        by_p = (velocity - speed[..., None] * u) / distance[..., None]
+        e = np.concatenate(
+            [(distance - self.range) / self.range_std, (speed - self.rate) / self.rate_std], axis=1
         )
-        if not any(same_track(problem, hypothesis, f) for f in found):
-            found.append(hypothesis)
-    against = hypothesis_costs(problem, found)
-    return [f for f, value in zip(found, against, strict=True) if value < NEGLIGIBLE]
+        since = self.since[:, None]
+        range_j, rate_j = (u, by_p)
+        if drifts:
+            range_j = np.concatenate([u, since * u], axis=2)
+            rate_j = np.concatenate([by_p, since * by_p + u], axis=2)
+        J = np.concatenate(
+            [range_j / self.range_std[:, None], rate_j / self.rate_std[:, None]], axis=1
+        )
+        known = ~np.isnan(e)
+        return np.where(known, e, 0.0), J * known[..., None]
 
-
-class _CoarseSearch:
-    """Start and current from some rows, for many starts at once.
-
-    The noise of dead reckoning is taken as noise of the measurements.
-    """
-
-    def __init__(self, problem: PlanarProblem, rows: NDArray[np.intp]) -> None:
-        r = problem.ranging
-        node = r.node[rows]
-        zero = np.zeros(problem.prior_sigma.size)
-        origin = problem.carried(np.zeros((1, 4)), zero, int(node[-1]) + 1)
-        self.moved = origin[node, :2]
-        self.since = problem.time[node] - problem.time[0]
-        self.velocity = np.column_stack([problem.velocity[node], problem.climb[node]])
-        self.velocity = self.velocity + problem.arm_velocity[node]
-        self.place = problem.place[r.beacon[rows]]
-        self.above = problem.height[node] + problem.arm[node, 2] - self.place[:, 2]
-        self.place = self.place[:, :2] - problem.arm[node, :2]
-        self.range, self.rate = r.range[rows], r.rate[rows]
-        lost = problem.step_cov + problem.share[:, None, None] ** 2 * problem.velocity_cov[1:]
-        wander = np.concatenate([[0.0], np.cumsum(np.trace(lost, axis1=1, axis2=2))])
-        slack = self._slack(problem) * np.nan_to_num(self.range)
-        self.range_std = np.sqrt(r.range_std[rows] ** 2 + 0.5 * wander[node] + slack**2)
-        rate_var = r.rate_std[rows] ** 2
-        rate_var = rate_var + 0.5 * np.trace(problem.velocity_cov[node], axis1=1, axis2=2)
-        self.rate_std = np.sqrt(rate_var)
-        drifts = "current" in problem.columns
-        self.prior_sigma = problem.prior_sigma[problem.columns["current"]] if drifts else zero[:0]
-        self.start_mean = problem.start_mean
-        self.start_info = np.linalg.inv(problem.start_cov)
-
-    @staticmethod
-    def _slack(problem: PlanarProblem) -> float:
-        """Return what constants that are not searched for may do to a range, relative to it."""
-        small = ("sound_speed_error", "log_scale_error")
-        sigmas = [p.sigma[0] for p in problem.constants if p.stem in small]
-        return float(np.sqrt(np.sum(np.square(sigmas))))
-
-    def starts(self) -> Array:
+    def starts(self, drifts: bool) -> Array:
         """Return starts (S, 2 or 4): by the geometry of the range rate, and all around."""
         good = np.flatnonzero(~np.isnan(self.range))
         flat = np.sqrt(np.maximum(self.range[good] ** 2 - self.above[good] ** 2, 1.0))
@@ -126,52 +127,142 @@ class _CoarseSearch:
             from_beacon = level[:, None] * np.stack([np.sin(bearing), np.cos(bearing)], axis=1)
             out.append(self.place[rows] + from_beacon - self.moved[rows])
         p = np.concatenate(out) if out else np.zeros((0, 2))
-        return np.column_stack([p, np.zeros((p.shape[0], self.prior_sigma.size))])
+        return np.column_stack([p, np.zeros((p.shape[0], 2 * drifts))])
 
-    def _residuals(self, x: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (S, 2 K), 0 where none, and Jacobians (S, 2 K, 2 or 4)."""
-        drifts = x.shape[1] == 4
-        current = x[:, 2:] if drifts else np.zeros((x.shape[0], 2))
-        p = x[:, None, :2] + self.moved + current[:, None] * self.since[:, None]
-        flat = p - self.place
-        distance = np.sqrt(np.sum(flat**2, axis=2) + self.above**2)
-        velocity = self.velocity[:, :2] + current[:, None]
-        speed = (np.sum(flat * velocity, axis=2) + self.above * self.velocity[:, 2]) / distance
-        u = flat / distance[..., None]
-        by_p = (velocity - speed[..., None] * u) / distance[..., None]
-        e = np.concatenate(
-            [(distance - self.range) / self.range_std, (speed - self.rate) / self.rate_std], axis=1
-        )
-        since = self.since[:, None]
-        range_j, rate_j = (u, by_p)
-        if drifts:
-            range_j = np.concatenate([u, since * u], axis=2)
-            rate_j = np.concatenate([by_p, since * by_p + u], axis=2)
-        J = np.concatenate(
-            [range_j / self.range_std[:, None], rate_j / self.rate_std[:, None]], axis=1
-        )
-        known = ~np.isnan(e)
-        return np.where(known, e, 0.0), J * known[..., None]
+
+def ranging_rows(track: DeadReckoning, frame: LocalFrame, body_axes: BodyAxes) -> RangingRows:
+    """Return the rows of the beacons' record that the track covers."""
+    grid, beacons, s = track.time, track.beacons, track.beacons.settings
+    # What constants that are not searched for may do to a range, relative to it.
+    slack = np.hypot(s.sound_speed_error_std, track.log.settings.scale_error_std)
+    level = np.zeros((grid.size, 3))
+    level[:, 2] = track.heading
+    arm_n = rotation_from_rph(level, body_axes) @ np.array(s.lever_arm_m)
+    covered = (beacons.time >= grid[0]) & (beacons.time <= grid[-1])
+    rows = np.flatnonzero(~beacons.missing & covered)
+    time = beacons.time[rows]
+
+    def at(values: Array) -> Array:
+        return interpolate(time, grid, values)
+
+    names = list(s.positions)
+    place = frame.position(*beacons.places.T)[[names.index(name) for name in beacons.name[rows]]]
+    arm = at(arm_n)
+    velocity = np.column_stack([track.velocity, track.climb]) + np.gradient(arm_n, grid, axis=0)
+    wander = at(track.spread)
+    noise = np.median(np.diff(track.spread) / np.diff(grid)) if grid.size > 1 else 0.0
+    interval = float(np.median(np.diff(grid)))
+    range_ = beacons.range[rows]
+    return RangingRows(
+        time=time,
+        moved=at(track.displacement),
+        velocity=at(velocity),
+        place=place[:, :2] - arm[:, :2],
+        above=at(track.height) - frame.height + arm[:, 2] - place[:, 2],
+        range=range_,
+        rate=beacons.range_rate[rows],
+        range_std=np.sqrt(
+            s.range_std_m**2
+            + track.height_std**2
+            + 0.5 * wander
+            + (slack * np.nan_to_num(range_)) ** 2
+        ),
+        rate_std=np.sqrt(s.range_rate_std_m_s**2 + 0.5 * noise / interval + _LEAST_RATE_STD**2)
+        * np.ones(time.size),
+        since=time - grid[0],
+    )
+
+
+@dataclass(frozen=True)
+class Found:
+    """A start that the ranges allow.
+
+    Parameters
+    ----------
+    position : ndarray, shape (2,), m
+        First position, east and north.
+    current : ndarray, shape (2,), m/s
+        Current; zero where none is estimated.
+    echoes : ndarray, shape (2, M)
+        Whether ranges and rates of all rows so far are beyond the gate there.
+    """
+
+    position: Array
+    current: Array
+    echoes: Array
+
+
+def search(
+    rows: RangingRows, mean: Array, std: Array, current_std: Array | None
+) -> Iterator[Found]:
+    """Yield starts that fit rows, without knowing where they begin, the best first.
+
+    Only start and current are searched for, on some of the rows, for all starts at once.
+
+    Parameters
+    ----------
+    rows : RangingRows
+        The data so far.
+    mean, std : ndarray, shape (2,), m
+        Prior of the first position.
+    current_std : ndarray, shape (2,), m/s, optional
+        Of the current; None where none is estimated.
+    """
+    total = rows.time.size
+    if total < _LEAST_ROWS:
+        return
+    coarse = _Coarse(
+        rows.some(np.unique(np.linspace(0, total - 1, _SEARCHED).astype(int))),
+        np.concatenate([mean, np.zeros(0 if current_std is None else 2)]),
+        np.concatenate([std, np.zeros(0) if current_std is None else current_std]),
+    )
+    x = coarse.descend(coarse.rows.starts(current_std is not None))
+    if not x.size:
+        return
+    cost = coarse.cost(x)
+    residuals, _ = rows.residuals(x)
+    tried: list[Array] = []
+    for i in np.argsort(cost):
+        if cost[i] > cost.min() + _FOLLOWED:
+            break
+        if any(np.hypot(*(x[i, :2] - other)) < 1.0 for other in tried):
+            continue
+        tried.append(x[i, :2])
+        current = x[i, 2:] if current_std is not None else np.zeros(2)
+        yield Found(x[i, :2], current, np.abs(residuals[i]).reshape(2, -1) > GATE)
+
+
+@dataclass(frozen=True)
+class _Coarse:
+    """Start and current from some rows, for many starts at once.
+
+    The noise of dead reckoning is taken as noise of the measurements.
+    """
+
+    rows: RangingRows
+    mean: Array
+    std: Array
 
     def cost(self, x: Array) -> Array:
         """Return the truncated cost of each start, (S,)."""
-        e, _ = self._residuals(x)
-        from_mean = x[:, :2] - self.start_mean
-        return 0.5 * (
-            np.sum(np.minimum(e**2, GATE**2), axis=1)
-            + np.sum((x[:, 2:] / self.prior_sigma) ** 2, axis=1)
-            + np.einsum("si,ij,sj->s", from_mean, self.start_info, from_mean)
-        )
+        e, _ = self.rows.residuals(x)
+        prior = np.sum(((x - self.mean) / self.std) ** 2, axis=1)
+        return np.asarray(0.5 * (np.sum(np.minimum(e**2, GATE**2), axis=1) + prior))
 
     def descend(self, x: Array) -> Array:
-        """Return the starts after some graduated Gauss-Newton steps, each damped by its own."""
-        size = x.shape[1]
-        prior = np.zeros((size, size))
-        prior[:2, :2] = self.start_info
-        prior[2:, 2:] = np.diag(1.0 / self.prior_sigma**2)
-        mean = np.concatenate([self.start_mean, np.zeros(size - 2)])
-        scale = np.diag([1.0 / 100.0**2] * 2 + [1.0] * (size - 2))
-        e, J = self._residuals(x)
+        """Return the starts after some graduated Gauss-Newton steps, each damped by its own.
+
+        Yang et al., Graduated non-convexity for robust spatial perception, IEEE RA-L 5(2), 2020.
+        While the current is hardly known, the cost has a narrow minimum, curved around the
+        beacon, along which straight steps are tiny; so each goes along a geodesic (Transtrum and
+        Sethna, Improvements to the Levenberg-Marquardt algorithm for nonlinear least-squares
+        minimization, arXiv:1201.5885).
+        """
+        if not x.size:
+            return x
+        prior = np.diag(1.0 / self.std**2)
+        scale = np.diag([1.0 / 100.0**2] * 2 + [1.0] * (x.shape[1] - 2))
+        e, J = self.rows.residuals(x)
         largest = np.maximum(np.max(e**2, axis=1), GATE**2)
         control = GATE**2 / (2.0 * largest - GATE**2)
         damping = np.full(x.shape[0], 1.0)
@@ -179,7 +270,7 @@ class _CoarseSearch:
         best = x.copy()
         for step in range(_STEPS):
             mu = control[:, None] if step < _STEPS - 8 else np.full((x.shape[0], 1), np.inf)
-            w = truncation_weights(e**2, np.broadcast_to(mu, e.shape))
+            w = _truncation_weights(e**2, np.broadcast_to(mu, e.shape))
             now = 0.5 * np.sum(w * e**2, axis=1)
             # With other weights it is another cost: only a gross failure is taken back.
             worse = now > 4.0 * cost + 10.0
@@ -187,40 +278,27 @@ class _CoarseSearch:
             damping = np.where(worse, damping * 8.0, damping * 0.5)
             best, cost = x, np.where(worse, cost, now)
             if worse.any():
-                e, J = self._residuals(x)
-                w = truncation_weights(e**2, np.broadcast_to(mu, e.shape))
+                e, J = self.rows.residuals(x)
+                w = _truncation_weights(e**2, np.broadcast_to(mu, e.shape))
             weighted = J * w[..., None]
             H = J.transpose(0, 2, 1) @ weighted + prior + damping[:, None, None] * scale
-            g = np.sum(weighted * e[..., None], axis=1) + (x - mean) @ prior
+            g = np.sum(weighted * e[..., None], axis=1) + (x - self.mean) @ prior
             dx = -np.linalg.solve(H, g[..., None])[..., 0]
-            # Geodesic acceleration, as in the smoother.
-            probe, _ = self._residuals(x + 0.1 * dx)
+            probe, _ = self.rows.residuals(x + 0.1 * dx)
             curvature = 20.0 * ((probe - e) / 0.1 - np.einsum("skj,sj->sk", J, dx))
-            ddx = -np.linalg.solve(H, np.einsum("skj,sk->sj", weighted, curvature)[..., None])[
-                ..., 0
-            ]
+            bent = np.einsum("skj,sk->sj", weighted, curvature)
+            ddx = -np.linalg.solve(H, bent[..., None])[..., 0]
             lengths = [np.hypot(*d[:, :2].T) for d in (dx, ddx)]
             x = x + dx + 0.5 * ddx * (lengths[1] <= 0.75 * lengths[0])[:, None]
-            e, J = self._residuals(x)
+            e, J = self.rows.residuals(x)
             control = np.minimum(control * 1.3, 1e3)
         return x
 
 
-def same_track(problem: PlanarProblem, a: Fit, b: Fit) -> bool:
-    """Whether two fits are the same track, judged by the data.
-
-    They are if at the end of the shorter they bear from the beacon in directions that differ
-    by less than three standard deviations. (Their distances to it agree, being measured.)
-    """
-    last = min(a.p.shape[0], b.p.shape[0]) - 1
-    place = problem.place[problem.ranging.beacon[problem.rows(last + 1) - 1], :2]
-    one, other = a.p[last] - place, b.p[last] - place
-    if np.hypot(*(one - other)) < 1.0:
-        return True
-    shorter = a if a.p.shape[0] - 1 == last else b
-    P = covariance(problem, shorter, last_only=True)[0][0, :2, :2]
-    distance = max(float(np.hypot(*one)), 1.0)
-    across = np.array([one[1], -one[0]]) / distance
-    turn = np.arctan2(other[0], other[1]) - np.arctan2(one[0], one[1])
-    arc = distance * abs(wrapped(turn))
-    return bool(arc < 3.0 * np.sqrt(across @ P @ across))
+def _truncation_weights(squares: Array, control: Array) -> Array:
+    """Return weights of squared whitened residuals; an infinite control parameter truncates."""
+    hard = np.isinf(control)
+    mu = np.where(hard, 1.0, control)
+    with np.errstate(divide="ignore"):
+        soft = GATE / np.sqrt(squares) * np.sqrt(mu * (mu + 1.0)) - mu
+    return np.where(hard, squares <= GATE**2, np.clip(soft, 0.0, 1.0))

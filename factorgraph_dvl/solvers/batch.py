@@ -16,13 +16,15 @@ from factorgraph_dvl.plausibility.survey import accepted_errors, explained, surv
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.solution import Progress, Solution
+from factorgraph_dvl.solvers.calibration import calibration
+from factorgraph_dvl.solvers.curved_posterior import points_along_arc
 from factorgraph_dvl.solvers.fixed_directions import (
     SolvedProblem,
     undetermined_there,
     with_covariances,
 )
+from factorgraph_dvl.solvers.hypotheses import relative_costs
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.minima import (
     competing_minima,
@@ -32,12 +34,15 @@ from factorgraph_dvl.solvers.minima import (
     joined,
     most_probable_minimum,
 )
+from factorgraph_dvl.solvers.planar_preparation import PlanarPreparation, prepare_planar
+from factorgraph_dvl.solvers.planar_setup import Track
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import Prepared, prepare
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import SettledMinimum, settle
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
 from factorgraph_dvl.solvers.stretch import started_from_stretch
-from factorgraph_dvl.solvers.summary import summarise
+from factorgraph_dvl.solvers.summary import summarise, trajectory
 from factorgraph_dvl.trial import Trial
 
 
@@ -102,11 +107,10 @@ def solve_with_problem(
     state_interval_s: float = STATE_INTERVAL,
     anyway: bool = False,
     progress: Progress | None = None,
-) -> tuple[Solution, SolvedProblem | None]:
+) -> tuple[Solution, SolvedProblem]:
     """Return the solution of a trial, and its problem at the most probable minimum.
 
-    That of a planar trial is of another kind, and None here. Parameters and errors are those of
-    `solve`.
+    Parameters and errors are those of `solve`.
     """
     _check_above_zero("rate_hz", rate_hz)
     _check_above_zero("state_interval_s", state_interval_s)
@@ -117,12 +121,6 @@ def solve_with_problem(
     records = survey(trial)
     errors = accepted_errors(records, anyway=anyway)
     with explained(errors):
-        if trial.planar:
-            # Its solver is loaded for such trials only.
-            from factorgraph_dvl.ranging.planar_solution import solve_planar
-
-            found = solve_planar(trial, rate_hz=rate_hz, progress=report)
-            return found.with_findings(records.problems), None
         prepared = _prepared(trial, state_interval_s, report)
         found, solved = _most_probable(trial, prepared, rate_hz, report)
     return found.with_findings(errors), solved
@@ -130,6 +128,8 @@ def solve_with_problem(
 
 def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:
     """Return what the minimisation of a trial starts from."""
+    if trial.planar:
+        return prepare_planar(trial, report)
     if trial.imu is None:
         return started_from_stretch(prepare_without_imu(trial), report)
     return prepare(trial, state_interval_s, report)
@@ -142,13 +142,43 @@ def _most_probable(
     solutions, best = [], []
     for states in prepared.start_positions.states:
         minima = _minima(prepared, states, prepared.findings, report)
-        against = np.array([evidence_against(each) for each in minima])
-        summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
-        solutions.append(most_probable_minimum(summaries, against))
+        if isinstance(prepared, PlanarPreparation):
+            solutions.append(_along_arc(trial, prepared, minima[0], rate_hz, report))
+        else:
+            against = np.array([evidence_against(each) for each in minima])
+            summaries = [summarise(trial, each, rate_hz=rate_hz) for each in minima]
+            solutions.append(most_probable_minimum(summaries, against))
         best.append(minima[0])
-    costs = significant_costs([cost_terms(each) for each in best])
+    if isinstance(prepared, PlanarPreparation):
+        costs = relative_costs([Track(b.problem, b.minimum.evaluation, True) for b in best])
+    else:
+        costs = significant_costs([cost_terms(each) for each in best])
     likeliest = int(np.argmin(costs))
     return joined(solutions, costs, prepared.start_positions.hypotheses), best[likeliest]
+
+
+def _along_arc(
+    trial: Trial,
+    prepared: PlanarPreparation,
+    found: SolvedProblem,
+    rate_hz: float,
+    report: Progress,
+) -> Solution:
+    """Return the solution of a track, with the spread along the arc that ranges leave."""
+    points, against = points_along_arc(found, prepared.setup.rows.place, report)
+    whole = summarise(trial, found, rate_hz=rate_hz)
+    if len(points) == 1:
+        return whole
+    spread = []
+    for each in points:
+        estimates, covariance = calibration(each)
+        motion = trajectory(each, trial.body_axes, rate_hz)
+        spread.append(
+            replace(whole, estimates=estimates, covariance=covariance, trajectory=motion)
+        )
+    mixture = most_probable_minimum(spread, against)
+    # They are no minima, but one that is drawn out.
+    return replace(mixture, findings=whole.findings, iterations=whole.iterations)
 
 
 def solved_problems(

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from msgspec import structs
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.inertial_chain import IMU_NOISE, WALK
-from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.graph.inertial_chain import WALK
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, squares_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
-from factorgraph_dvl.statistics.leverage import leverage
-from factorgraph_dvl.statistics.rows import native_rows
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Keys of the walks, and what walks.
@@ -99,7 +97,7 @@ def bias_walks(
     information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
     imu = prepared.trial.inertial
     walking = [bias for name, bias in _WALKS.items() if getattr(imu.settings, name) > 0.0]
-    sources = [IMU_NOISE, *map(WALK.format, walking)]
+    sources = [*IMU_NOISE, *map(WALK.format, walking)]
     if not _is_not_noise(*_squares(problem, minimum.evaluation, information, sources)):
         return None
     found = [
@@ -122,7 +120,7 @@ def _with_walks(
     stated = prepared.trial.inertial.settings
     walks = {name: _START[name] for name in names}
     for _ in range(_ESTIMATES):
-        walking = _stating(prepared, walks)
+        walking = prepared.with_imu(**walks)
         chain = walking.chain(evaluation.states)
         test = Problem(
             chain,
@@ -148,7 +146,7 @@ def _with_walks(
         if max(abs(ratio - 1.0) for ratio in ratios.values()) < _SAME_WALK:
             break
         walks = {name: walk * ratios[name] for name, walk in walks.items()}
-    squares, freedom = _squares(test, evaluation, minimum.information, [IMU_NOISE])
+    squares, freedom = _squares(test, evaluation, minimum.information, IMU_NOISE)
     least = min(walks[name] / max(getattr(stated, name), 1e-12) for name in names)
     if not _fits(test, evaluation) or _is_not_noise(squares, freedom) or least < _AS_STATED:
         return None
@@ -163,30 +161,17 @@ def _with_walks(
     return BiasWalks(walking, evaluation, against, findings)
 
 
-def _stating(prepared: Preparation, walks: dict[str, float]) -> Preparation:
-    """Return what is prepared, with walks of the biases as if they were stated."""
-    imu = prepared.trial.inertial
-    settings = structs.replace(imu.settings, **walks)
-    return replace(prepared, trial=replace(prepared.trial, imu=replace(imu, settings=settings)))
-
-
 def _squares(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
     sources: Iterable[str],
 ) -> tuple[float, float]:
-    """Return the squares of residuals of some sources, and what they are by chance."""
-    wanted = set(sources)
-
-    def rows() -> Iterator[Rows]:
-        return (r for r in native_rows(problem, evaluation) if r.source in wanted)
-
-    squares, count = 0.0, 0
-    for each in rows():
-        squares += float(np.sum(each.vector**2))
-        count += each.vector.size
-    return squares, count - sum(float(h.sum()) for _, h in leverage(rows, count, information))
+    """Return the squares of residuals of some sources together, and what they are by chance."""
+    squares, freedom = np.sum(
+        [*squares_of(problem, evaluation, information, sources).values()], axis=0
+    )
+    return float(squares), float(freedom)
 
 
 def _is_not_noise(squares: float, freedom: float) -> bool:

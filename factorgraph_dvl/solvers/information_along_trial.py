@@ -63,15 +63,12 @@ def solve_with_history(
     entries: int | None = None,
     anyway: bool = False,
     progress: Progress | None = None,
-) -> tuple[Solution, InformationHistory | None]:
+) -> tuple[Solution, InformationHistory]:
     """Solve a trial, and follow the information on its constants along it.
 
-    A planar trial has no such history. Parameters and errors as of `solvers.batch.solve`;
-    `entries` as of `information_history`.
+    Parameters and errors as of `solvers.batch.solve`; `entries` as of `information_history`.
     """
     solution, solved = solve_with_problem(trial, rate_hz=rate_hz, anyway=anyway, progress=progress)
-    if solved is None:
-        return solution, None
     if progress:
         progress("information along the trial", 0, None)
     return solution, information_history(solved, entries=entries)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -23,13 +24,13 @@ from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.motion_strengths import Strengths
 from factorgraph_dvl.solvers.outliers import robust_weights
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions, positions_from_ranges
 from factorgraph_dvl.solvers.state_times import dense_epochs
 from factorgraph_dvl.trial import Trial
 
@@ -151,6 +152,12 @@ class Preparation:
     def chain(self, states: States) -> InertialChain:
         """Return the inertial part of the graph, with gravity along the track of states."""
         return inertial_chain(self.trial, self.frame, self.segments, states)
+
+    def with_imu(self, **keys: float) -> Preparation:
+        """Return it with keys of the IMU as if they were stated."""
+        imu = self.trial.inertial
+        settings = msgspec.structs.replace(imu.settings, **keys)
+        return replace(self, trial=replace(self.trial, imu=replace(imu, settings=settings)))
 
     def mountings_at(self, chain: InertialChain, states: States) -> list[dict[str, Array]]:
         """Return values of the mountings that fit the motion of states, the best first."""

@@ -25,7 +25,6 @@ from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.ranging.position_from_ranges import StartPositions
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -35,6 +34,7 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import Strengths, motion_strengths
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
 

@@ -16,6 +16,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
@@ -28,12 +29,14 @@ from factorgraph_dvl.solvers.steps import (
     Correlation,
     Gates,
     GrossErrors,
+    ImuNoise,
     KnownParameters,
     MotionStrengths,
     Noise,
     Proposal,
     States,
     Step,
+    Uncorrelated,
     Walks,
 )
 
@@ -103,7 +106,8 @@ def settle(
     known = KnownParameters()
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(), walks,
+        MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(),
+        ImuNoise(), Uncorrelated(), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:
@@ -155,7 +159,7 @@ def _start(
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
     tilt = None
-    if chain.interpolates and constants_prior is None:
+    if isinstance(chain, SmoothChain) and constants_prior is None:
         tilt = Tilt.holding(prepared.parameters, values)
     processes = prepared.stated_processes(chain, states, values)
     model = Model(

@@ -28,6 +28,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     with_innovations,
     with_others,
 )
+from factorgraph_dvl.solvers.imu_noise import lower_noise
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated, Model
@@ -42,6 +43,8 @@ from factorgraph_dvl.statistics.variance_components import (
 
 # Shares of a change of noise that are tried in turn. Chosen: what is left changes no σ.
 _SHARES = (1.0, 0.5, 0.25, 0.125)
+# The same of noise whose estimates fall by less and less. Chosen: three estimates in one.
+_FURTHER = 3.0
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
@@ -223,6 +226,27 @@ class Correlation:
 
 
 @dataclass
+class Uncorrelated:
+    """Noise that was found to persist: whether it still does, as other noise is known better."""
+
+    name = "correlation that is none"
+    _for: tuple[Any, ...] | None = None
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield models without one of the processes that were found."""
+        model = at.model
+        own = model.prepared, _labels(model)
+        if _are_those(own, self._for) or not at.minimum.converged:
+            return
+        self._for = own
+        stated = {p.label for p in model.stated_processes}
+        for process in model.processes:
+            if process.label not in stated and process.parameter is None:
+                left = tuple(p for p in model.processes if p is not process)
+                yield _from(at, processes=left)
+
+
+@dataclass
 class KnownParameters:
     """Parameters that are stated as known, but that the data say have another value."""
 
@@ -288,6 +312,32 @@ class Noise:
             if _same(changed, before) and _are_those(part, model.processes):
                 return
             yield _from(at, noise_factors=changed, processes=part)
+
+
+class ImuNoise:
+    """Noise of gyros and accelerometers below what is stated, by restricted likelihood."""
+
+    name = "noise of the IMU"
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the noise that the motion between states shows, then part of the way to it."""
+        prepared = at.model.prepared
+        if not (isinstance(prepared, Preparation) and at.minimum.converged):
+            return
+        imu = prepared.trial.inertial
+        if not prepared.trial.estimates_noise(imu):
+            return
+        found = lower_noise(at.problem, at.minimum)
+        if not found:
+            return
+        # What is left of an estimate falls by a part of it each time.
+        for share in (_FURTHER, *_SHARES):
+            keys = {
+                key: getattr(imu.settings, key) * factor**share for key, factor in found.items()
+            }
+            less = prepared.with_imu(**keys)
+            chain = less.chain(at.states)
+            yield _from(at, prepared=less, chain=chain, track=at.states.p_n)
 
 
 @dataclass

@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
@@ -29,6 +30,7 @@ from factorgraph_dvl.solvers.error_budget import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.heading_and_misalignment import heading_and_misalignment
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.planar_setup import planar_trajectory
 from factorgraph_dvl.solvers.true_times import trajectory_at_true_times
 from factorgraph_dvl.statistics.robust_weights import windows
 from factorgraph_dvl.trial import Trial
@@ -81,7 +83,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         cost=evaluation.cost,
         estimates=estimates,
         covariance=covariance,
-        trajectory=_trajectory(found, trial.body_axes, rate_hz),
+        trajectory=trajectory(found, trial.body_axes, rate_hz),
         residuals=residuals,
         findings=tuple(findings),
         rejected=rejected,
@@ -92,9 +94,11 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     )
 
 
-def _trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
+def trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
     """Return the motion at a rate, at true times."""
     chain = found.problem.chain
+    if isinstance(chain, PlanarChain):
+        return planar_trajectory(found, chain, rate_hz)
     if chain.interpolates:
         at = found.minimum.evaluation
         return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)

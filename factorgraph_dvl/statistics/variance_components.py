@@ -47,6 +47,14 @@ class NoiseFactor:
     factor: Array
     redundancy: Array
 
+    @classmethod
+    def of(cls, squares: float, freedom: float) -> NoiseFactor:
+        """Return the factor of one component from squares of its residuals and their freedom."""
+        if freedom < _LEAST_REDUNDANCY:
+            return cls(np.ones(1), np.array([freedom]))
+        found = np.sqrt((squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM))
+        return cls(np.array([max(found, LEAST_FACTOR)]), np.array([freedom]))
+
     def after(self, applied: Array) -> Array:
         """Return the factors (d,) to apply next: those that were, where these are no others."""
         chance = _CHANCE / np.sqrt(2.0 * np.maximum(self.redundancy, 0.5))

@@ -57,7 +57,7 @@ def test_the_demo_is_the_shipped_trial_and_opens_its_page(
         asked.append((config.name, config.read_text(), options["seed"]))
         save_trial(build_trial(), trial)
 
-    monkeypatch.setattr("factorgraph_dvl.cli.demo.simulate", simulate)
+    monkeypatch.setattr("factorgraph_dvl.cli.simulate.simulate", simulate)
     result = run("demo", "--out", tmp_path / "demo")
     assert result.code == 0, result.err
     page = tmp_path / "demo" / "result" / "report.html"

@@ -5,7 +5,7 @@ import pytest
 from plans import CALM
 from truth import scenario
 
-from factorgraph_dvl.planning.library import library
+from factorgraph_dvl.planning.proposal import library
 from factorgraph_dvl.simulation import plan_motion
 
 

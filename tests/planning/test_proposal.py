@@ -11,8 +11,8 @@ from truth import scenario
 
 import factorgraph_dvl.planning.proposal as proposing
 from factorgraph_dvl.planning import predict, propose
-from factorgraph_dvl.planning.library import Item, Library, library
 from factorgraph_dvl.planning.prediction import extend
+from factorgraph_dvl.planning.proposal import Item, Library, library
 from factorgraph_dvl.report.files.plan import proposal_lines
 
 

@@ -9,8 +9,13 @@ import pytest
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.files.trial_yaml import TrialSettings, to_yaml
 from factorgraph_dvl.report.tables import imu_lines
-from factorgraph_dvl.sensors.imu import ImuErrorStd, ImuSettings
-from factorgraph_dvl.sensors.imu_grades import TYPICAL, ZERO_WITHOUT_GRADE, Grade
+from factorgraph_dvl.sensors.imu import (
+    TYPICAL,
+    ZERO_WITHOUT_GRADE,
+    Grade,
+    ImuErrorStd,
+    ImuSettings,
+)
 from factorgraph_dvl.settings.yaml_file import parse_yaml
 
 STATED = {

@@ -8,7 +8,7 @@ import solved
 from truth import TURNING, scenario
 
 from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
-from factorgraph_dvl.report.figures.error_budget import error_budget_figure
+from factorgraph_dvl.report.figures.calibration import error_budget_figure
 from factorgraph_dvl.report.tables import error_budget_table
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
@@ -37,7 +37,12 @@ def test_sources_add_up_to_the_covariance():
     scale = np.sqrt(np.diag(P))
     difference = (sum(parts.values()) - P) / np.outer(scale, scale)
     assert np.abs(difference).max() < 1e-9
-    assert {"IMU noise", "DVL velocity", "prior of accel_bias_ug"} <= parts.keys()
+    assert {
+        "gyro noise",
+        "accelerometer noise",
+        "DVL velocity",
+        "prior of accel_bias_ug",
+    } <= parts.keys()
 
 
 def test_causes_add_up_to_the_reported_variances(solution):
@@ -46,7 +51,8 @@ def test_causes_add_up_to_the_reported_variances(solution):
     by_name = {c.cause: c for c in solution.error_budget}
     assert by_name["noise of GNSS position"].assumed == "0.5, 0.5, 1 m"
     assert by_name["prior of gyro_bias_deg_h"].assumed == "0.05 deg/h"
-    assert by_name["IMU noise"].assumed == "0.0005 deg/√h, 25 µg/√Hz"
+    assert by_name["gyro noise"].assumed == "0.0005 deg/√h"
+    assert by_name["accelerometer noise"].assumed == "25 µg/√Hz"
 
 
 def test_directions_that_are_fixed_have_their_share():

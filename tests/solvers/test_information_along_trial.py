@@ -11,7 +11,7 @@ from problems import SHORT, dense_covariance, problem_of, walking
 from truth import config, scenario
 
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
-from factorgraph_dvl.analysis.information.shares import information_shares
+from factorgraph_dvl.analysis.information.observability import information_shares
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph import keys

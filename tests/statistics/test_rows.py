@@ -59,7 +59,12 @@ def test_rows_are_those_of_the_graph(system):
 def test_sources_have_names(system):
     problem, _, rows = system
     found = {r.source for r in rows}
-    assert {"IMU noise", "prior of the first state", "prior of gyro_bias_deg_h"} <= found
+    assert {
+        "gyro noise",
+        "accelerometer noise",
+        "prior of the first state",
+        "prior of gyro_bias_deg_h",
+    } <= found
     assert {"prior of misalignment_deg", "DVL velocity", "GNSS position"} <= found
     assert ("random walk of accel_bias_ug" in found) == problem.chain.walking
     assert ("motion while the IMU is silent" in found) == (not problem.chain.walking)

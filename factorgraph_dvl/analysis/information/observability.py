@@ -11,11 +11,50 @@ from factorgraph_dvl.analysis.information.linearization import PointSet, point_s
 from factorgraph_dvl.analysis.information.manoeuvres import Segment, find_segments, given_segments
 from factorgraph_dvl.analysis.information.marginals import Marginals, marginals
 from factorgraph_dvl.analysis.information.segment_singular_values import BodyMotion, body_motion
-from factorgraph_dvl.analysis.information.shares import Shares, information_shares
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import Trial
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Shares of the information on each component; they add up to 1.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Names of the P components.
+    prior : ndarray, shape (P,)
+        Share of the prior.
+    segments : ndarray, shape (S, P)
+        Share of each segment.
+    """
+
+    names: tuple[str, ...]
+    prior: Array
+    segments: Array
+
+
+def information_shares(history: InformationHistory, segments: Sequence[Segment]) -> Shares:
+    """Return the shares of the prior and of each segment.
+
+    Parameters
+    ----------
+    history : InformationHistory
+        Information along the whole trial.
+    segments : sequence of Segment
+        Consecutive segments; data before the first and after the last count with these.
+    """
+    last = history.root[-1]
+    P = last @ last.T
+    # (P e_i)ᵀ L(t) (P e_i) with L(t) = (S Sᵀ)⁻¹, at the prior and at the ends of segments.
+    ends = [np.searchsorted(history.time, s.end + 1e-6) - 1 for s in segments[:-1]]
+    at = [0, *(int(np.clip(k, 0, None)) for k in ends), history.time.size - 1]
+    known = np.stack([np.sum(np.linalg.solve(history.root[k], P) ** 2, axis=0) for k in at])
+    known /= np.diag(P)
+    return Shares(history.names, known[0], np.diff(known, axis=0))
+
 
 # Chosen: uncertainty of the ends of segments that were found, s: half of a slow ramp.
 _MARGIN_S = 5.0

@@ -15,13 +15,12 @@ from matplotlib.patches import Patch
 from factorgraph_dvl.analysis.information.linearization import PointSet
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
 from factorgraph_dvl.analysis.information.marginals import OPEN, Marginals
-from factorgraph_dvl.analysis.information.observability import Observability
+from factorgraph_dvl.analysis.information.observability import Observability, Shares
 from factorgraph_dvl.analysis.information.segment_singular_values import (
     OBSERVABLE,
     SPURIOUS,
     SingularValues,
 )
-from factorgraph_dvl.analysis.information.shares import Shares
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.figures.calibration import heat_map, readable

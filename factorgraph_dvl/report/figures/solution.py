@@ -19,9 +19,12 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.estimates import Residuals, Trajectory
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.report.figures.beams import beam_quality_figure
-from factorgraph_dvl.report.figures.calibration import calibration_figure, correlation_figure
+from factorgraph_dvl.report.figures.calibration import (
+    calibration_figure,
+    correlation_figure,
+    error_budget_figure,
+)
 from factorgraph_dvl.report.figures.drawing import Canvas, save_figures
-from factorgraph_dvl.report.figures.error_budget import error_budget_figure
 from factorgraph_dvl.report.figures.residuals import residuals_figure
 from factorgraph_dvl.report.figures.trajectory import motion_figure, track_figure
 from factorgraph_dvl.solution import Solution

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
-from factorgraph_dvl.analysis.information.shares import information_shares
+from factorgraph_dvl.analysis.information.observability import information_shares
 from factorgraph_dvl.statistics.information_history import InformationHistory
 
 PARTS = [Segment(0.0, 10.0, "first"), Segment(10.0, 20.0, "second")]

@@ -130,7 +130,7 @@ def test_precision_and_units() -> None:
 def test_an_error_budget_fits_80_columns() -> None:
     solution = build_solution()
     adds = np.concatenate([e.std for e in solution.estimates])
-    causes = ("prior of beacon_sound_speed_error", "noise of DVL velocity", "IMU noise")
+    causes = ("prior of beacon_sound_speed_error", "noise of DVL velocity", "gyro noise")
     budget = tuple(Cause(name, "", adds / 2.0) for name in causes)
     solution = replace(solution, error_budget=budget)
     table = error_budget_table(solution)

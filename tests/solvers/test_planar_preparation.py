@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from planar import BASE, STRAIGHT, changed, error_of, trial
 
-from factorgraph_dvl import kalman, predict, solve
+from factorgraph_dvl import kalman, predict, solve, solved_problems
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import ConfigError, DataError, SolveError
 from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.solution_folder import load_solution
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.quality.results import mostly_rejected
-from factorgraph_dvl.ranging.planar_solution import solve_planar
 from factorgraph_dvl.simulation import parse_scenario
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
@@ -26,7 +25,7 @@ SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "20"))
 def test_ranges_without_rates_are_enough():
     t = trial(2, beacons={"range_rate_std_m_s": None})
     assert np.isnan(t.beacons.range_rate).all()
-    solution = solve_planar(t, rate_hz=1.0)
+    solution = solve(t, rate_hz=1.0)
     assert len([h for h in solution.hypotheses if h.died is None]) in (0, 1)
     assert np.hypot(*error_of(t, solution).T).max() < 40.0
 
@@ -34,13 +33,13 @@ def test_ranges_without_rates_are_enough():
 @pytest.mark.slow
 def test_echoes_are_named_and_lost_ranges_do_no_harm():
     clean, echoes = trial(4), trial(4, beacons={"multipath": 0.2, "missed": 0.1})
-    solution = solve_planar(echoes, rate_hz=1.0)
+    solution = solve(echoes, rate_hz=1.0)
     longer = echoes.beacons.range - clean.beacons.range > 1.0
     rejected = np.concatenate([r.time for r in solution.rejected if r.unit == "m"])
     assert longer.sum() > 40
     assert np.isin(echoes.beacons.time[longer], rejected).all()
     assert rejected.size <= longer.sum() + 2
-    best = solve_planar(clean, rate_hz=1.0)
+    best = solve(clean, rate_hz=1.0)
     rms = [np.sqrt(np.mean(error_of(a, b) ** 2)) for a, b in ((clean, best), (echoes, solution))]
     assert rms[1] < max(1.3 * rms[0], 3.0)
 
@@ -48,7 +47,7 @@ def test_echoes_are_named_and_lost_ranges_do_no_harm():
 def test_a_depth_that_is_noisier_than_the_ranges_counts_as_it_does():
     deep = {"positions": {"B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -400}}}
     t = trial(0, depth={"rate_hz": 1, "std_m": 3.0}, beacons={**deep, "range_std_m": 0.3})
-    solution = solve_planar(t, rate_hz=0.2)
+    solution = solve(t, rate_hz=0.2)
     assert sum(r.time.size for r in solution.rejected) < 10
     normalised = error_of(t, solution) / solution.trajectory.position_std[:, :2]
     assert np.abs(normalised).max() < 4.0
@@ -65,7 +64,7 @@ def test_too_few_ranges_are_no_position():
         range_rate=t.beacons.range_rate[few],
     )
     with pytest.raises(SolveError, match="4 ranges are too few"):
-        solve_planar(changed(t, cut))
+        solve(changed(t, cut))
 
 
 def test_files_and_commands(tmp_path, capsys):
@@ -86,7 +85,7 @@ def test_files_and_commands(tmp_path, capsys):
 
     assert run("solve", tmp_path / "t", "--out", tmp_path / "s", "--no-figures") == 0
     solution = load_solution(tmp_path / "s")
-    assert solution.solver == "planar"
+    assert solution.solver == "batch"
     assert np.hypot(*error_of(t, solution).T).max() < 30.0
     assert run("kalman", tmp_path / "t", "--out", tmp_path / "k", "--no-figures") == 0
     assert load_solution(tmp_path / "k").solver == "kalman-4sv-3ob"
@@ -98,7 +97,9 @@ def test_files_and_commands(tmp_path, capsys):
 def test_one_call_solves_any_trial():
     t = trial(2, trial={"initial": {"position_std_m": [5, 5, 1]}})
     solution = solve(t, rate_hz=1.0)
-    np.testing.assert_array_equal(solution.covariance, solve_planar(t, rate_hz=1.0).covariance)
+    np.testing.assert_array_equal(solution.covariance, solve(t, rate_hz=1.0).covariance)
+    solved, *_ = solved_problems(t)
+    assert solved.minimum.evaluation.cost == pytest.approx(solution.cost, rel=1e-9)
     assert kalman(t).solver == "kalman-4sv-3ob"
     with pytest.raises(DataError, match="no DVL"):
         kalman(t, "wahba")
@@ -137,7 +138,7 @@ def test_a_straight_run_is_covered_and_never_decided():
     for seed in range(SEEDS):
         current = np.random.default_rng([seed, 1]).normal(0.0, 0.3, 2)
         t = trial(seed, **STRAIGHT, current_m_s=[*current.tolist(), 0.0])
-        solution = solve_planar(t, rate_hz=1.0)
+        solution = solve(t, rate_hz=1.0)
         error = error_of(t, solution)
         covered.append(np.mean(np.abs(error) < 2.0 * solution.trajectory.position_std[:, :2]))
         assert len([h for h in solution.hypotheses if h.died is None]) == 2
@@ -149,7 +150,7 @@ def test_the_covariance_is_honest():
     nees, covered, right = [], [], []
     for seed in range(SEEDS):
         t = trial(seed, beacons={"sound_speed_error": "draw", "sound_speed_error_std": 0.001})
-        solution = solve_planar(t, rate_hz=1.0)
+        solution = solve(t, rate_hz=1.0)
         error = error_of(t, solution)
         P = solution.trajectory.position_cov[:, :2, :2]
         nees.append(np.einsum("mi,mij,mj->m", error, np.linalg.inv(P), error).mean())

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planar import STRAIGHT, changed, trial
+from planar import STRAIGHT, changed, setup_of, trial
 
 from factorgraph_dvl.errors import DataError, SolveError
 from factorgraph_dvl.plausibility.survey import survey
 from factorgraph_dvl.quality.finding import Code
-from factorgraph_dvl.ranging.planar_solution import solve_planar
-from factorgraph_dvl.ranging.problem import planar_setup
+from factorgraph_dvl.solvers.batch import solve
 
 SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
 
@@ -21,25 +20,25 @@ def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
     t = trial(**STRAIGHT)
     b = t.beacons
     ends = np.append(b.time[:-1], t.records[0].time[-1] - 1e-12)
-    setup = planar_setup(changed(t, replace(b, time=ends)))
-    assert np.diff(setup.problem.time).min() > 0.5
-    assert solve_planar(changed(t, replace(b, time=ends)), rate_hz=1.0).converged
+    setup = setup_of(changed(t, replace(b, time=ends)))
+    assert np.diff(setup.chain.node_time).min() > 0.5
+    assert solve(changed(t, replace(b, time=ends)), rate_hz=1.0).converged
 
 
 def test_clocks_that_do_not_fit_are_refused():
     t = trial()
     late = changed(t, replace(t.beacons, time=t.beacons.time + 1e5))
     with pytest.raises(DataError, match=r"1 to 315 s: they are from 100001 to 100315 s"):
-        planar_setup(late)
+        setup_of(late)
     heading = t.records[0]
     with pytest.raises(DataError, match=r"one value every 1000 s; expected .* 60 s apart"):
-        planar_setup(changed(t, replace(heading, time=1e3 * heading.time)))
+        setup_of(changed(t, replace(heading, time=1e3 * heading.time)))
     nothing = np.full(t.beacons.time.size, np.nan)
     empty = changed(t, replace(t.beacons, range=nothing, range_rate=nothing))
     with pytest.raises(DataError, match="no range and no range rate"):
-        planar_setup(empty)
+        setup_of(empty)
     with pytest.raises(SolveError, match="0 ranges are too few"):
-        solve_planar(changed(t, replace(t.beacons, range=nothing)))
+        solve(changed(t, replace(t.beacons, range=nothing)))
 
 
 def jumping(t, at, by):
@@ -51,10 +50,10 @@ def jumping(t, at, by):
 @pytest.mark.parametrize(("at", "kept"), [(20.0, (20.0, 315.0)), (250.0, (0.0, 250.0))])
 def test_only_the_part_between_jumps_with_most_ranges_is_used(at, kept):
     t = jumping(trial(), at, 1.3e9)
-    setup = planar_setup(t)
+    setup = setup_of(t)
     first, last = np.array(kept) + (1.3e9 if at < 100.0 else 0.0)
-    assert first <= setup.problem.time[0] <= first + 1.0
-    assert last - 1.0 <= setup.problem.time[-1] <= last
+    assert first <= setup.chain.node_time[0] <= first + 1.0
+    assert last - 1.0 <= setup.chain.node_time[-1] <= last
     codes = [f.code for f in survey(t).findings]
     assert codes.count(Code.CLOCK_JUMP) == 3
     assert Code.GAPS not in codes
@@ -63,10 +62,10 @@ def test_only_the_part_between_jumps_with_most_ranges_is_used(at, kept):
 def test_a_long_trial_before_a_jump_is_no_gap():
     t = trial()
     slow = changed(t, *(replace(r, time=20.0 * r.time) for r in t.records))
-    setup = planar_setup(jumping(slow, 6000.0, 1.3e9))
-    assert np.ptp(setup.problem.time) > 5900.0
+    setup = setup_of(jumping(slow, 6000.0, 1.3e9))
+    assert np.ptp(setup.chain.node_time) > 5900.0
 
 
 def test_the_trajectory_of_a_trial_with_a_jump_is_no_longer_than_its_records():
-    found = solve_planar(jumping(trial(**SHORT), 5.0, 1.3e9), rate_hz=1.0)
+    found = solve(jumping(trial(**SHORT), 5.0, 1.3e9), rate_hz=1.0)
     assert found.trajectory.time.size < 70

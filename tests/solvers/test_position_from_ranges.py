@@ -9,10 +9,10 @@ from truth import exact_states, scenario
 
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
-from factorgraph_dvl.ranging import hypotheses
-from factorgraph_dvl.ranging.position_from_ranges import positions_from_ranges
-from factorgraph_dvl.ranging.smoother import fit
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers import hypotheses
+from factorgraph_dvl.solvers.planar_setup import PlanarSetup
+from factorgraph_dvl.solvers.position_from_ranges import positions_from_ranges
 
 BEACONS = {
     "rate_hz": 2,
@@ -42,14 +42,14 @@ def test_without_ranges_the_states_stay():
 
 
 def test_with_gnss_only_outliers_are_sought(monkeypatch):
-    fits = []
+    fits, fit = [], PlanarSetup.fitted
 
-    def counted(*args, **options):
+    def counted(self, *args):
         fits.append(args)
-        return fit(*args, **options)
+        return fit(self, *args)
 
     monkeypatch.setattr(hypotheses, "search", None)
-    monkeypatch.setattr(hypotheses, "fit", counted)
+    monkeypatch.setattr(PlanarSetup, "fitted", counted)
     trial, frame, seg, states = prepared()
     beacons = trial.beacons
     wrong = np.arange(20, beacons.time.size, 20)

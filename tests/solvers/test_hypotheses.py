@@ -8,12 +8,12 @@ from findings import of_code
 from planar import STRAIGHT, error_of, trial, truth
 
 from factorgraph_dvl.quality.finding import Code
-from factorgraph_dvl.ranging.planar_solution import solve_planar
+from factorgraph_dvl.solvers.batch import solve
 
 
 def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
     t = trial(1, **STRAIGHT)
-    solution = solve_planar(t, rate_hz=1.0)
+    solution = solve(t, rate_hz=1.0)
     living = [h for h in solution.hypotheses if h.died is None]
     assert len(living) == 2
     assert sum(h.weight for h in living) == pytest.approx(1.0)
@@ -32,7 +32,7 @@ def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
 
 def test_after_a_turn_by_30_degrees_the_wrong_one_is_dead():
     t = trial(3)
-    solution = solve_planar(t, rate_hz=1.0)
+    solution = solve(t, rate_hz=1.0)
     first, second = solution.hypotheses[:2]
     assert first.died is None
     assert 150.0 < second.died < 175.0

@@ -1,0 +1,79 @@
+"""Noise of the IMU below what is stated, from what the motion between states shows of it.
+
+The record bounds the noise from above (`imu.noise`); a data sheet may state ten times as much. The
+IMU then counts for too little, and errors of other sensors take its place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from factorgraph_dvl.graph.inertial_chain import ACCEL_NOISE, GYRO_NOISE
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.statistics.leverage import leverage
+from factorgraph_dvl.statistics.rows import native_rows
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.variance_components import NoiseFactor
+
+IMU_NOISE = (GYRO_NOISE, ACCEL_NOISE)
+# Keys of the settings that state each of them.
+_KEYS = {GYRO_NOISE: "gyro_noise_deg_sqrt_h", ACCEL_NOISE: "accel_noise_ug_sqrt_hz"}
+
+
+def squares_of(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    sources: Iterable[str],
+) -> dict[str, tuple[float, float]]:
+    """Return the squares of residuals by source, and what they are by chance.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised.
+    evaluation : Evaluation
+        Its minimum.
+    information : SquareRootInformation
+        Information there.
+    sources : iterable of str
+        Of native factors.
+    """
+    wanted = set(sources)
+
+    def rows() -> Iterator[Rows]:
+        return (r for r in native_rows(problem, evaluation) if r.source in wanted)
+
+    squares, freedom = dict.fromkeys(sorted(wanted), 0.0), dict.fromkeys(sorted(wanted), 0.0)
+    count = 0
+    for each in rows():
+        squares[each.source] += float(np.sum(each.vector**2))
+        count += each.vector.size
+    for each, h in leverage(rows, count, information):
+        freedom[each.source] += float(np.sum(1.0 - h))
+    return {name: (squares[name], max(freedom[name], 0.0)) for name in squares}
+
+
+def lower_noise(problem: Problem, minimum: Minimum) -> dict[str, float]:
+    """Return factors below 1 on stated noise of the IMU, by key of its settings.
+
+    By the fixed point of the restricted likelihood, as of other sensors (`variance_components`);
+    those that may be chance are left out.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was minimised.
+    minimum : Minimum
+        Where it ended.
+    """
+    found = squares_of(problem, minimum.evaluation, minimum.information, IMU_NOISE)
+    out = {}
+    for source, (squares, freedom) in found.items():
+        factor = float(NoiseFactor.of(squares, freedom).after(np.ones(1))[0])
+        if factor < 1.0:
+            out[_KEYS[source]] = factor
+    return out
