@@ -158,7 +158,7 @@ def _unseen(
         return missing
     for group in set(o.noise_groups).difference(found):
         own = residuals[:, list(group)]
-        count = np.count_nonzero(np.isfinite(own))
+        count = int(np.isfinite(own).sum())
         lack = 1.0 - float(np.nansum(own**2)) / max(count, 1)
         if count and lack > _SURE * np.sqrt(2.0 / count):
             missing[list(group)] = np.sqrt(lack)

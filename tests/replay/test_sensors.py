@@ -243,9 +243,7 @@ def test_noise_that_is_stated_wrong_is_estimated(factor):
     solution, _ = replay(stated(trial, factor, factor), rate_hz=2.0)
     right = solve(trial)
     for noise in solution.noise:
-        # What residuals lack of the stated noise of positions may last for the whole record.
-        lasts = factor > 1.0 and noise.name == "gnss_position"
-        assert noise.factor == pytest.approx(1.0 if lasts else 1.0 / factor, rel=0.15)
+        assert noise.factor == pytest.approx(1.0 / factor, rel=0.15)
     for name in ("misalignment_deg", "scale_error", "lever_arm_m"):
         a, b = solution.estimate(name), right.estimate(name)
         assert np.abs((a.value - b.value) / b.std).max() < 0.5

@@ -45,7 +45,8 @@ def test_noise_as_stated_stays_as_stated(trial, honest):
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)
 
 
-@pytest.mark.parametrize(("sensor", "wrong"), [("dvl", 5.0), ("dvl", 0.2), ("gnss", 0.2)])
+@pytest.mark.parametrize("wrong", [5.0, 0.2])
+@pytest.mark.parametrize("sensor", ["dvl", "gnss"])
 def test_stated_noise_wrong_by_five_is_recovered(trial, honest, sensor, wrong):
     solution = solve(stated(trial, **{f"factor_{sensor}": wrong}), rate_hz=1.0)
     assert solution.converged
@@ -55,21 +56,6 @@ def test_stated_noise_wrong_by_five_is_recovered(trial, honest, sensor, wrong):
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
     large = {f.sensor for f in solution.findings if f.code == Code.LARGE_RESIDUALS}
     assert bool(large) == (wrong < 1.0)
-
-
-def test_of_a_receiver_stated_too_uncertain_the_position_of_the_whole_is(trial, honest):
-    """Residuals do not show an error that lasts; it may be there, and does little harm."""
-    solution = solve(stated(trial, factor_gnss=5.0), rate_hz=1.0)
-    assert solution.converged
-    found = {n.name: n for n in solution.noise}
-    np.testing.assert_allclose(found["gnss_velocity"].factor, 0.2, rtol=0.15)
-    np.testing.assert_allclose(found["gnss_position"].factor, 1.0, atol=0.05)
-    assert found["gnss_position"].correlation_time.min() > trial.imu.time[-1]
-    position = solution.trajectory.position_std
-    stated_std = 5.0 * trial.gnss.position_std[0]
-    assert np.all((position > 0.8 * stated_std) & (position < stated_std))
-    ratio = np.sqrt(np.diag(solution.covariance) / np.diag(honest.covariance))
-    assert np.all((ratio > 0.95) & (ratio < 1.2)), ratio
 
 
 def test_a_sensor_whose_noise_is_stated_keeps_it(trial):
