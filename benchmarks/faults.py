@@ -46,8 +46,6 @@ LONGEST_S = 900.0
 LARGE, SEEN = 5.0, 30.0
 # Time between two looks at the processes, s: a run takes longer.
 LOOK_S = 0.2
-# Times that the problem is bound to the clocks anew for a noncentrality.
-BINDINGS = 3
 
 
 @dataclass(frozen=True)
@@ -128,15 +126,9 @@ def _cost(trial: Trial) -> float:
     chain = prepared.chain(states)
     at_start = mounted_start(prepared, chain, states, _silent)
     states, values = at_start.states, at_start.values
-    cost = np.nan
-    for _ in range(BINDINGS):
-        problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
-        at = problem.values(states, problem.prior_values() | values)
-        found = minimise(problem, at, stage="noise as stated").evaluation
-        states, values, cost = found.states, found.parameters, found.cost
-        if not problem.needs_rebinding(values):
-            break
-    return float(cost)
+    problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
+    at = problem.values(states, problem.prior_values() | values)
+    return minimise(problem, at, stage="noise as stated").evaluation.cost
 
 
 def _silent(stage: str, iteration: int, cost: float | None) -> None:

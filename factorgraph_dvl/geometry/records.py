@@ -16,8 +16,14 @@ def rows_of(arrays: _Arrays, rows: slice | IntArray | BoolArray) -> _Arrays:
     """Return some rows of such a data class."""
     # What a frozen class does to set its fields takes longer than choosing few rows.
     out = object.__new__(type(arrays))
-    vars(out).update({name: values[rows] for name, values in vars(arrays).items()})
+    vars(out).update({name: _rows(values, rows) for name, values in vars(arrays).items()})
     return out
+
+
+def _rows(values: Any, rows: slice | IntArray | BoolArray) -> Any:
+    if values is None:
+        return None
+    return values[rows] if isinstance(values, np.ndarray) else rows_of(values, rows)
 
 
 def concatenated(parts: Sequence[_Arrays]) -> _Arrays:

@@ -19,17 +19,13 @@ from factorgraph_dvl.graph.clocks import linearized, parameters_of, time_on_chai
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.imu.propagation import extrapolated
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
 
-# How far, s, a motion is extrapolated before its measurements are bound anew. Measured: 2 Hz
-# sway of 4 deg then differs by 3e-6 rad/s from a straight line in the rate.
+# How far, s, two times count as one. Measured: 2 Hz sway of 4 deg then differs by 3e-6 rad/s from
+# a straight line in the rate.
 SAME_TIME = 2e-4
-# The same, s, before the motion is integrated anew on the way to a minimum. Measured: at most
-# 7e-5 rad/s in the same sway.
-EXTRAPOLATED = 1e-3
 # Unit of the residuals of attitudes.
 _ANGLE = "rad"
 
@@ -79,10 +75,8 @@ class BoundObservation:
         What carries the motion.
     attachment : Attached
         Where the measurements hang on it.
-    time : ndarray, shape (M,), s
-        When they were bound, by the clock of the nodes.
     usable : ndarray of bool, shape (M,)
-        Whether the motion is known there.
+        Whether they may be used: the motion was known there when they were bound.
     weight : ndarray, shape (M, d)
         Inverse standard deviations; 0 = not used.
     clock_zero : float, s
@@ -94,7 +88,6 @@ class BoundObservation:
     observation: Observation
     chain: Chain
     attachment: Any
-    time: Array
     usable: BoolArray
     weight: Array
     clock_zero: float
@@ -102,38 +95,23 @@ class BoundObservation:
 
     def __post_init__(self) -> None:
         # Until it is known that it does not.
-        self._sees_motion = self.chain.interpolates
+        self._sees_motion = True
 
     def single(self, i: int) -> BoundObservation:
-        """Return a measurement by itself, as if the node before it were the first."""
+        """Return a measurement by itself, as if the nodes around it were the first two."""
         index = np.array([i])
         whole = self.observation
         own = whole.some(index) if isinstance(whole, ObservationByRows) else None
-        at = rows_of(self.attachment, index)
-        local = replace(at, node=np.zeros(1, dtype=int))
+        chain = self.chain.from_node(int(self.attachment.node[i]))
         errors = self.errors
-        return BoundObservation(
-            ObservationRows(whole, index) if own is None else own,
-            self.chain.from_node(int(at.node[0])),
-            local,
-            self.time[index],
-            self.usable[index],
-            self.weight[index],
-            self.clock_zero,
-            None if errors is None else errors.of_rows(self.attachment, local, index),
-        )
-
-    def at(self, parameters: Mapping[str, Array]) -> BoundObservation:
-        """Return the measurements where clocks have moved them, at the same nodes."""
-        late, shift = self.late(parameters), self.chain.shift(parameters)
-        if not late.any() and not shift:
-            return self
-        at, errors = self.chain.later(self.attachment, late, shift), self.errors
         return replace(
             self,
-            attachment=at,
-            time=self.time + late,
-            errors=None if errors is None else errors.at(at, self.attachment),
+            observation=ObservationRows(whole, index) if own is None else own,
+            chain=chain,
+            attachment=None,
+            usable=self.usable[index],
+            weight=self.weight[index],
+            errors=None if errors is None else chain.errors(errors.parameters, errors.key_of),
         )
 
     def parameters(self, every: Sequence[Parameter]) -> tuple[Parameter, ...]:
@@ -164,48 +142,45 @@ class BoundObservation:
         with_nodes = clock is not None and clock.names[0] == self.chain.clock
         return own is not None and (with_nodes or self.observation.unit == _ANGLE)
 
+    def times(self, parameters: Mapping[str, Array]) -> Array:
+        """Return when measurements were made by clocks as they are, (M,), s, by that of nodes."""
+        return time_on_chain(self.observation, parameters, self.clock_zero, self.chain.clock)
+
     def attached(self, parameters: Mapping[str, Array]) -> Any:
         """Return where measurements hang on the chain by clocks as they are."""
-        time = self.time + self.late(parameters)
-        return self.chain.attach(time, self.chain.shift(parameters), turning=self.turning)
+        shift = self.chain.shift(parameters)
+        return self.chain.attach(
+            self.times(parameters), shift, turning=self.turning, before=self.attachment
+        )
 
-    def late(self, parameters: Mapping[str, Array]) -> Array:
-        """Return by how much clocks have moved measurements since they were bound, (M,), s."""
-        now = time_on_chain(self.observation, parameters, self.clock_zero, self.chain.clock)
-        return np.asarray(now - self.time)
+    def attach(self, parameters: Mapping[str, Array]) -> None:
+        """Attach measurements to the chain by clocks as they are."""
+        self.attachment = self.attached(parameters)
 
-    def motion(
-        self, states: Any, parameters: Mapping[str, Array], late: Array, *, moved: bool = False
-    ) -> Motion:
-        """Return the motion at the true times of measurements, `late` (M,) s after they are bound.
+    def motion(self, at: Any, states: Any, parameters: Mapping[str, Array]) -> Motion:
+        """Return the motion where measurements hang on the chain."""
+        return self.chain.motion(self._corrected(at, parameters), states)
 
-        Where a clock moves on the way to the minimum, a motion extrapolated from where the
-        measurements were bound would give the cost of another one: those that `moved` are not.
-        """
-        at, rest = self.attachment, late
-        if self.chain.interpolates:
-            return self.chain.motion(self.attached(parameters), states)
-        if moved:
-            at, rest = self.chain.attach(self.time + late), np.zeros_like(late)
-        if self.errors is not None:
-            vector = self.errors.vector(parameters)
-            at = self.errors.corrected(at, self.attachment, vector)
-        return extrapolated(self.chain.motion(at, states), rest)
+    def _corrected(self, at: Any, parameters: Mapping[str, Array]) -> Any:
+        """Return an attachment without errors of the IMU."""
+        if self.errors is None:
+            return at
+        by = self.errors.sensitivity(at)
+        return self.errors.without(at, by, self.errors.vector(parameters))
 
     def missing(
-        self, motion: Motion, parameters: Mapping[str, Array], processes: Processes
+        self, at: Any, motion: Motion, parameters: Mapping[str, Array], processes: Processes
     ) -> Array | None:
         """Return what the motion between nodes adds to the variance of measurements, (M, d).
 
-        None where it is recorded, and for attitudes, by which it is known.
+        None where that is nothing.
         """
         if not self._sees_motion:
             return None
         lin = self.linearized(motion, parameters, (), processes)
-        self._sees_motion = any(by is not None for by in (lin.d_p, lin.d_v, lin.d_omega))
-        if not self._sees_motion:
-            return None
-        return self.chain.missing(self.attached(parameters), lin)
+        missing = self.chain.missing(at, lin)
+        self._sees_motion = missing is not None
+        return missing
 
     def values(self, parameters: Mapping[str, Array], processes: Processes) -> Mapping[str, Array]:
         """Return the parameters that measurements see: what varies has a value for each."""
@@ -281,24 +256,20 @@ class BoundObservation:
             To times of a motion, by its identity and which they are: kept for other observations.
         """
         lin, when = lin.some(some), self.observation.time[some]
-        # A motion that is interpolated is never extrapolated from where measurements were bound.
-        bound = self.at(parameters) if self.chain.interpolates else self
-        attachment = rows_of(bound.attachment, some)
-        errors = self.errors
+        at, errors = rows_of(self.attachment, some), self.errors
         by = None if errors is None else rows_of(errors.sensitivity(self.attachment), some)
         here = (
             id(motion),
             some.tobytes() if isinstance(some, np.ndarray) else (some.start, some.stop),
         )
         if here not in transitions:
-            at = attachment
             if errors is not None and by is not None:
                 at = errors.without(at, by, errors.vector(parameters))
             transitions[here] = self.chain.transition(at, states, rows_of(motion, some))
         transition = transitions[here]
         found = dict(lin.d_parameters)
         if errors is not None and by is not None:
-            found |= errors.columns(lin, transition, by)
+            found |= errors.columns(lin, transition, by, errors.vector(parameters))
         by_chain = self.chain.node_jacobian(lin, transition)
         others = [found[name] for name in wanted]
         by_nodes = [

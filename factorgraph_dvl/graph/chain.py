@@ -188,14 +188,16 @@ class Chain(Protocol):
         """Return what is assumed of each of these sources, as text."""
 
     def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Any]
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> ImuErrors | None:
         """Return the errors of the IMU among parameters, None if there are none."""
 
     def covers(self, time: Array) -> BoolArray:
         """Whether the motion is known at times (M,)."""
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Any:
+    def attach(
+        self, time: Array, shift: float = 0.0, *, turning: bool = False, before: Any = None
+    ) -> Any:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest.
 
         Parameters
@@ -207,18 +209,15 @@ class Chain(Protocol):
         turning : bool, default False
             Whether they hang between the nodes that their attitude is between, as measurements of
             attitude do, and those that move with the nodes.
+        before : object, optional
+            Where they hung.
         """
 
-    def later(self, at: Any, late: Array, shift: float = 0.0) -> Any:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-
-    def left(self, at: Any, late: Array, tolerance: float) -> bool:
-        """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
-
-    def missing(self, at: Any, lin: Linearization) -> Array:
+    def missing(self, at: Any, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
-        Where the motion between nodes is not recorded.
+        None where these measurements are of nothing that varies between nodes.
+        Where the motion between nodes is not recorded, or recorded with noise.
         """
 
     def motion(self, at: Any, states: Any) -> Motion:

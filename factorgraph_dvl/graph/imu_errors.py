@@ -7,27 +7,30 @@ with the errors, so the errors get columns of their own in the linear factors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.records import rows_of
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.propagation import Attachment, Transition
+from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
+    at_errors,
     by_errors,
-    corrected,
+    carried_back_by,
+    corrected_two_way,
     elements,
-    moved,
     predicted,
     sensitivities,
 )
+from factorgraph_dvl.imu.two_way import shares
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -65,8 +68,6 @@ class ImuErrors:
         Errors that are estimated.
     keys : sequence of int
         Their keys.
-    attachments : sequence of Attachment
-        Where measurements hang on the chain.
     """
 
     def __init__(
@@ -74,18 +75,17 @@ class ImuErrors:
         segments: Segments,
         parameters: Sequence[Parameter],
         keys: Sequence[int],
-        attachments: Sequence[Attachment],
     ) -> None:
+        self.parameters = tuple(parameters)
         self.names = tuple(p.name for p in parameters)
+        self.key_of = dict(zip(self.names, keys, strict=True))
         self._keys = list(keys)
         self._sizes = [p.mean.size for p in parameters]
         self._segments = segments
         self._elements = elements(parameters)
-        unique = {id(at): at for at in attachments}
-        whole, found = sensitivities(segments, self._elements, list(unique.values()))
-        self._whole = whole
-        self._ends = predicted(segments, whole)
-        self._by: dict[int, Sensitivity] = dict(zip(unique, found, strict=True))
+        self._of_ends: Sensitivity | None = None
+        # For as long as something hangs there.
+        self._by: WeakKeyDictionary[Any, Sensitivity] = WeakKeyDictionary()
         self._factors: list[gtsam.JacobianFactor] = []
 
     def vector(self, parameters: Mapping[str, Array]) -> Array:
@@ -96,30 +96,52 @@ class ImuErrors:
         """Return by how much the predicted states at the ends of segments move, (S, 9)."""
         return np.asarray(self._ends @ self.vector(parameters))
 
-    def corrected(self, at: Attachment, bound: Attachment, errors: Array) -> Attachment:
-        """Return an attachment without the errors; `bound` is where it was bound."""
-        by = self._by[id(bound)]
-        if at is not bound:
-            by = moved(self._segments, at, bound, by, self._whole)
-        return self.without(at, by, errors)
+    def attach(self, attachments: Sequence[Any]) -> None:
+        """Find how what is integrated up to attached times moves, of all of them at once."""
+        new = [at for at in {id(at): at for at in attachments}.values() if at not in self._by]
+        if new or self._of_ends is None:
+            forward = [self.forward(at) for at in new]
+            self._of_ends, found = sensitivities(self._segments, self._elements, forward)
+            self._by.update(zip(new, found, strict=True))
 
-    def without(self, at: Attachment, by: Sensitivity, errors: Array) -> Attachment:
+    def forward(self, at: Any) -> Attachment:
+        """Return where times hang on the nodes before."""
+        return at.forward
+
+    @cached_property
+    def _ends(self) -> Array:
+        """Derivatives of the predicted states at the ends of segments, (S, 9, n)."""
+        if self._of_ends is None:
+            self.attach(())
+        assert self._of_ends is not None
+        return predicted(self._segments, self._of_ends)
+
+    def sensitivity(self, at: Any) -> Sensitivity:
+        """Return how what is integrated from the nodes before moves with the errors."""
+        self.attach([at])
+        return self._by[at]
+
+    def without(self, at: Any, by: Sensitivity, errors: Array) -> Any:
         """Return an attachment without the errors (n,), which move it by its sensitivity."""
-        return corrected(at, by, self._elements, errors)
+        assert self._of_ends is not None
+        return corrected_two_way(at, by, self._of_ends, self._segments, self._elements, errors)
 
     def columns(
-        self, lin: Linearization, transition: Transition, by: Sensitivity
+        self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array
     ) -> dict[str, Array]:
-        """Return derivatives of measurements with respect to the errors, (M, d, n_i) by name."""
-        every = by_errors(lin, transition, by, self._elements)
+        """Return derivatives of measurements by the errors (n,) there, (M, d, n_i) by name."""
+        every = self._every(lin, transition, by, errors)
         parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
         return dict(zip(self.names, parts, strict=True))
 
-    def at(self, attachment: Attachment, bound: Attachment) -> ImuErrors:
-        """Return the errors where measurements at `bound` have another attachment."""
-        out = copy(self)
-        out._by = {**self._by, id(attachment): self._by[id(bound)]}
-        return out
+    def _every(self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array) -> Array:
+        """Return derivatives of measurements by all errors (n,), (M, d, n)."""
+        assert self._of_ends is not None
+        by, ends = (at_errors(each, errors) for each in (by, self._of_ends))
+        back = carried_back_by(transition.at, by, ends)
+        ahead, behind = shares(lin, transition)
+        every = by_errors(ahead, transition.forward, by, self._elements)
+        return every + by_errors(behind, transition.backward, back, self._elements)
 
     def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
         """Return native factors with what errors (n,) change in those of the IMU.
@@ -135,16 +157,6 @@ class ImuErrors:
         more_cost = 0.5 * float(np.sum(change * (change - 2.0 * rhs)))
         jacobian = np.concatenate([whole[:, :, :-1], columns], axis=2)
         return LinearImuFactors(native, jacobian, rhs - change, more_cost)
-
-    def sensitivity(self, bound: Attachment) -> Sensitivity:
-        """Return how what is integrated up to measurements moves with the errors."""
-        return self._by[id(bound)]
-
-    def of_rows(self, bound: Attachment, rows: Attachment, some: IntArray) -> ImuErrors:
-        """Return the same for some measurements (K,) of those that are bound, with `rows`."""
-        out = copy(self)
-        out._by = {id(rows): rows_of(self._by[id(bound)], some)}
-        return out
 
     def factors(self, graph: gtsam.NonlinearFactorGraph) -> list[gtsam.CustomFactor]:
         """Return the IMU factors, which a graph begins with, as they depend on the errors."""

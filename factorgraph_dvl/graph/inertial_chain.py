@@ -27,7 +27,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.chain import StepRows
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.node_jacobian import node_jacobian
+from factorgraph_dvl.graph.node_jacobian import two_way_jacobian
 from factorgraph_dvl.graph.priors import (
     PRIOR,
     ConstantsPrior,
@@ -38,13 +38,14 @@ from factorgraph_dvl.graph.priors import (
 )
 from factorgraph_dvl.graph.trajectory import EPOCH_ROUNDING, trajectory_between
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
-from factorgraph_dvl.imu.propagation import (
-    Attachment,
-    States,
-    Transition,
-    attach_inside,
-    later,
-    motion_at,
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.imu.two_way import (
+    TwoWay,
+    TwoWayTransition,
+    attach_two_way,
+    motion_two_way,
+    noise_between,
+    transition_two_way,
 )
 from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -168,7 +169,7 @@ class InertialChain:
     @property
     def sizes(self) -> list[int]:
         """Dimensions of the variables of a measurement."""
-        return [STATE_SIZE, BIAS_SIZE]
+        return [STATE_SIZE, BIAS_SIZE, STATE_SIZE, *([BIAS_SIZE] if self.walking else [])]
 
     @cached_property
     def zeros(self) -> gtsam.Values:
@@ -200,12 +201,20 @@ class InertialChain:
         return self._states(values, range(self.node_time.size))
 
     def states_around(self, values: gtsam.Values, k: int) -> States:
-        """Return the states that measurements after node k depend on: its own."""
-        return self._states(values, range(k, k + 1))
+        """Return the states that measurements after node k depend on: its own, and the next."""
+        return self._states(values, range(k, k + 2))
 
     def from_node(self, k: int) -> InertialChain:
-        """Return what carries the motion of measurements after node k, taken as the first."""
-        return self
+        """Return what carries the motion from node k to the next, which then are the first two."""
+        seg = self.segments
+        i = int(np.searchsorted(seg.origin, k))
+        own = replace(
+            seg.part(slice(i, i + 1)),
+            origin=np.zeros(1, dtype=int),
+            node_time=seg.node_time[k : k + 2],
+            arc_nodes=np.array([[0, 1]]),
+        )
+        return replace(self, segments=own, gravity_n=self.gravity_n[i : i + 1])
 
     def _states(self, values: gtsam.Values, nodes: range) -> States:
         # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
@@ -230,37 +239,47 @@ class InertialChain:
         """Return 0: attitudes are at the times of the nodes."""
         return 0.0
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Attachment:
+    def attach(
+        self,
+        time: Array,
+        shift: float = 0.0,
+        *,
+        turning: bool = False,
+        before: TwoWay | None = None,
+    ) -> TwoWay:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
-        return attach_inside(self.segments, time, self.frame.earth_rate)[0]
+        return attach_two_way(self.segments, time, self.frame.earth_rate)
 
-    def later(self, at: Attachment, late: Array, shift: float = 0.0) -> Attachment:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return later(at, late, self.frame.earth_rate)
+    def missing(self, at: TwoWay, lin: Linearization) -> Array | None:
+        """Return the variance (M, d) that noise of the IMU leaves of what is predicted.
 
-    def left(self, at: Attachment, late: Array, tolerance: float) -> bool:
-        """Whether measurements later by (M,) s are to be bound anew; tolerance in s."""
-        return bool(np.abs(late).max() > tolerance)
+        None for positions and attitudes: it is below a millimetre there, and below the noise of
+        the gyro over a second.
+        """
+        if lin.d_v is None:
+            return None
+        out = self.imu.accel_noise_root_psd**2 * np.sum(lin.d_v**2, axis=2)
+        if lin.d_theta is not None:
+            out = out + self.imu.gyro_noise_root_psd**2 * np.sum(lin.d_theta**2, axis=2)
+        return noise_between(at)[:, None] * out
 
-    def missing(self, at: Attachment, lin: Linearization) -> Array:
-        """Return zero: the IMU recorded the motion."""
-        return np.zeros_like(lin.residual)
+    def motion(self, at: TwoWay, states: States) -> Motion:
+        """Return the motion at M attached times, carried from the nodes on both sides."""
+        return motion_two_way(at, states, self.gravity_n, self.frame.earth_rate)
 
-    def motion(self, at: Attachment, states: States) -> Motion:
-        """Return the motion at M attached times, carried forward from the nodes before."""
-        return motion_at(at, states, self.gravity_n, self.frame.earth_rate)
+    def transition(self, at: TwoWay, states: States, motion: Motion) -> TwoWayTransition:
+        """Return the derivatives of the motion at attached times by the nodes on both sides."""
+        return transition_two_way(at, states, motion, self.frame.earth_rate)
 
-    def transition(self, at: Attachment, states: States, motion: Motion) -> Transition:
-        """Return the derivatives of the motion at attached times by the nodes before."""
-        return Transition(at, states, motion, self.frame.earth_rate)
-
-    def node_jacobian(self, lin: Linearization, transition: Transition) -> Array:
-        """Return the derivative of residuals by the variables of measurements, (M, d, 15)."""
-        return node_jacobian(lin, transition)
+    def node_jacobian(self, lin: Linearization, transition: TwoWayTransition) -> Array:
+        """Return the derivative of residuals by the variables of measurements, (M, d, n)."""
+        return two_way_jacobian(lin, transition, walking=self.walking)
 
     def variables(self, node: IntArray) -> list[IntArray]:
         """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
-        return [keys.nodes(node), keys.bias(0) + self.walking * node]
+        before = [keys.nodes(node), keys.bias(0) + self.walking * node]
+        after = [keys.nodes(node + 1), keys.bias(0) + self.walking * (node + 1)]
+        return [*before, *(after if self.walking else after[:1])]
 
     def add_prior(
         self,
@@ -365,7 +384,7 @@ class InertialChain:
         }
 
     def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attachment]
+        self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> ImuErrors | None:
         """Return the errors of the IMU among parameters; None if none is estimated.
 
@@ -375,11 +394,9 @@ class InertialChain:
             Those that are estimated.
         key_of : mapping of str to int
             Their keys.
-        at : sequence of Attachment
-            Where measurements hang on the chain.
         """
         own = [p for p in parameters if p.name in ERRORS]
-        return ImuErrors(self.segments, own, [key_of[p.name] for p in own], at) if own else None
+        return ImuErrors(self.segments, own, [key_of[p.name] for p in own]) if own else None
 
     def bias_key(self, k: int) -> int:
         """Return the key of the bias at node k."""

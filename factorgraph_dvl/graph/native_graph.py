@@ -108,7 +108,8 @@ def _measurement_factor(
     def linearize(at: gtsam.Values) -> tuple[Array, Array]:
         values = parameters_at(at)
         states = problem.chain.states_around(at, k)
-        motion = single.motion(states, values, single.late(values), moved=False)
+        single.attach(values)
+        motion = single.motion(single.attachment, states, values)
         lin = single.linearized(motion, values, wanted, processes)
         matrix, residual = single.jacobian(
             lin, slice(None), motion, states, values, wanted, processes, {}

@@ -276,20 +276,19 @@ class PlanarChain:
         """Return 0: all nodes are at true times."""
         return 0.0
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Attached:
+    def attach(
+        self,
+        time: Array,
+        shift: float = 0.0,
+        *,
+        turning: bool = False,
+        before: Attached | None = None,
+    ) -> Attached:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         time = np.clip(time, self.node_time[0], self.node_time[-1])
         node = np.searchsorted(self.node_time, time, side="right") - 1
         node = np.clip(node, 0, self.count - 1)
         return Attached(node, node, time)
-
-    def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return replace(at, time=at.time + late)
-
-    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
-        """Return False: where measurements are between nodes is followed."""
-        return False
 
     @cached_property
     def _down_b(self) -> Array:
@@ -430,9 +429,7 @@ class PlanarChain:
         """Yield nothing: it has no parameters of its own."""
         yield from ()
 
-    def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attached]
-    ) -> None:
+    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
         """Return None: there is no IMU."""
 
     def trajectory(

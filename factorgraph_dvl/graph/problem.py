@@ -1,10 +1,11 @@
 """A trial as a factor graph: native IMU factors, and sensors linearised in bulk.
 
-A measurement hangs on the node before it through the increments up to its own time.
-Each sensor states its residual in terms of the motion at that time; the chain rule
-takes it to the node. All measurements of a kind are evaluated in one NumPy pass and
-written into one Jacobian factor per node, because a Python callback per factor would be
-slow and makes GTSAM's optimisers copy all values.
+A measurement hangs on the nodes around it, through what was measured of the motion in between.
+Each sensor states its residual in terms of the motion at its time; the chain rule takes it to the
+nodes. A clock that is estimated moves its measurements along the chain at every evaluation. All
+measurements of a kind are evaluated in one NumPy pass and written into one Jacobian factor per
+node, because a Python callback per factor would be slow and makes GTSAM's optimisers copy all
+values.
 """
 
 from __future__ import annotations
@@ -20,17 +21,10 @@ import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.bound_observation import (
-    EXTRAPOLATED,
-    SAME_TIME,
-    BoundObservation,
-    Processes,
-    processes_of,
-)
+from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes, processes_of
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
@@ -49,7 +43,6 @@ from factorgraph_dvl.graph.priors import (
 )
 from factorgraph_dvl.graph.processes import Process, in_time_order
 from factorgraph_dvl.graph.template import jacobian_template
-from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.gross_errors import gross_errors
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -95,8 +88,8 @@ class Evaluation:
     states, parameters : object or dict of str to ndarray
         The same as arrays: states as the chain has them, parameters by name, rotations as
         matrices.
-    motions, residuals : list of Motion or list of ndarray
-        Per observation; residuals whitened, (M, d).
+    attached, motions, residuals : list of Attached, of Motion or of ndarray
+        Per observation: where it hangs on the chain; residuals whitened, (M, d).
     cost : float
         Half the sum of all squared whitened residuals.
     own_cost : float
@@ -108,6 +101,7 @@ class Evaluation:
     values: gtsam.Values
     states: Any
     parameters: dict[str, Array]
+    attached: list[Any]
     motions: list[Motion]
     residuals: list[Array]
     cost: float
@@ -175,8 +169,6 @@ class Problem:
         Correlated errors of the observations, at most one each.
     usable : mapping of str to ndarray of bool, optional
         By label, measurements (M,) that may be used where the chain covers them; by default all.
-    attached : sequence of (ndarray, Attachment), optional
-        Times (M,) that are attached already, such as those of another problem's `attached`.
     tilt : Tilt, optional
         Gradient of the objective by the parameters that no residual has.
 
@@ -195,9 +187,6 @@ class Problem:
         Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
         By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
-    clock_tolerance : mapping of str to float
-        By name of a clock's offset, how far, s, it may move measurements before they are to be
-        bound anew: for clocks that sway, or noise of the IMU's samples, moves to and fro.
 
     Examples
     --------
@@ -219,7 +208,6 @@ class Problem:
         clock_zero: float | None = None,
         processes: Sequence[Process] = (),
         usable: Mapping[str, BoolArray] | None = None,
-        attached: Sequence[tuple[Array, Attachment]] = (),
         tilt: Tilt | None = None,
     ) -> None:
         self.chain = chain
@@ -245,13 +233,14 @@ class Problem:
         self.long_run: Mapping[str, Array] = {}
         self.gain = 0.0
         self.robust_weights: Mapping[str, Array] = {}
-        self.clock_tolerance: Mapping[str, float] = {}
         self.bound_at = {**self.prior_values(), **(start or {})}
+        # Where measurements were at the last evaluation, by their times.
+        self._attachments: dict[Hashable, Any] = {}
         self._bound: list[BoundObservation] = []
         for observation in observations:
             may_be_used = (usable or {}).get(observation.label)
-            self._bound.append(self._bind(observation, may_be_used, attached))
-        self._imu_errors = chain.errors(self.parameters, self._key, self.attachments)
+            self._bound.append(self._bind(observation, may_be_used))
+        self._imu_errors = chain.errors(self.parameters, self._key)
         blocks: dict[tuple[tuple[str, ...], ...], _Block] = {}
         for bound in self._bound:
             bound.errors = self._imu_errors
@@ -269,33 +258,6 @@ class Problem:
     def bound(self) -> tuple[BoundObservation, ...]:
         """The observations as they are tied to the chain."""
         return tuple(self._bound)
-
-    @property
-    def attachments(self) -> tuple[Attachment, ...]:
-        """Where the observations hang on the chain."""
-        return tuple(b.attachment for b in self._bound)
-
-    def attached(
-        self, some: Sequence[IntArray | slice], first: int = 0
-    ) -> list[tuple[Array, Attachment]]:
-        """Return the true times of some measurements, and where they hang on a part of the chain.
-
-        Parameters
-        ----------
-        some : sequence of ndarray of int or slice
-            Which of each observation's.
-        first : int, default 0
-            First segment of that part.
-        """
-        out = {}
-        for bound, own in zip(self._bound, some, strict=True):
-            if id(bound.attachment) not in out:
-                at = rows_of(bound.attachment, own)
-                out[id(bound.attachment)] = (
-                    bound.time[own],
-                    replace(at, segment=at.segment - first),
-                )
-        return list(out.values())
 
     @property
     def imu_errors(self) -> ImuErrors | None:
@@ -388,20 +350,45 @@ class Problem:
             own_cost += 0.5 * float(np.vdot(step.residual, step.residual))
         for process in self.processes:
             own_cost += 0.5 * float(np.sum(process.prior_residuals(parameters[process.name]) ** 2))
+        attached = self._attached_at(parameters)
         motions = []
-        computed: dict[tuple[int, bytes, bool], Motion] = {}
-        for bound in self._bound:
-            late = bound.late(parameters)
-            moved = bool(np.abs(late).max() > self._tolerance(bound, EXTRAPOLATED))
+        computed: dict[int, Motion] = {}
+        for bound, at in zip(self._bound, attached, strict=True):
             # Measurements at the same true times share the motion, of whatever sensor they are.
-            shared = (id(bound.attachment), late.tobytes(), moved)
-            if shared not in computed:
-                computed[shared] = bound.motion(states, parameters, late, moved=moved)
-            motions.append(computed[shared])
+            if id(at) not in computed:
+                computed[id(at)] = bound.motion(at, states, parameters)
+            motions.append(computed[id(at)])
         residuals, cost = self._whitened(motions, parameters)
         return Evaluation(
-            values, states, parameters, motions, residuals, own_cost + cost, own_cost, imu
+            values,
+            states,
+            parameters,
+            attached,
+            motions,
+            residuals,
+            own_cost + cost,
+            own_cost,
+            imu,
         )
+
+    def _attached_at(self, parameters: dict[str, Array]) -> list[Any]:
+        """Return where observations hang on the chain.
+
+        Those at the same times have the same attachment, until a clock moves them.
+        """
+        shift = self.chain.shift(parameters)
+        found: dict[Hashable, Any] = {}
+        out = []
+        for bound in self._bound:
+            own = (bound.turning, shift, bound.times(parameters).tobytes())
+            if own not in found:
+                at = self._attachments.get(own)
+                found[own] = bound.attached(parameters) if at is None else at
+            out.append(found[own])
+        self._attachments = found
+        if self._imu_errors is not None:
+            self._imu_errors.attach(out)
+        return out
 
     def without_tilt(self, evaluation: Evaluation) -> Evaluation:
         """Return an evaluation whose cost is that of residuals alone."""
@@ -517,12 +504,14 @@ class Problem:
         """
         factors = self.noise_factors if factors is None else factors
         out = []
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
+        for bound, at, motion in zip(
+            self._bound, evaluation.attached, evaluation.motions, strict=True
+        ):
             label = bound.observation.label
             own = factors.get(label, 1.0) * self.long_run.get(label, 1.0)
             values = bound.values(evaluation.parameters, self.processes_of(bound))
             sigma = bound.observation.sigma(motion, values, own)
-            missing = bound.missing(motion, evaluation.parameters, self.processes_of(bound))
+            missing = bound.missing(at, motion, evaluation.parameters, self.processes_of(bound))
             out.append(sigma if missing is None else np.sqrt(sigma**2 + missing))
         return out
 
@@ -561,8 +550,7 @@ class Problem:
 
         Its measurement factors are written in place at the next call.
         """
-        if self.chain.interpolates:
-            self._follow(evaluation.parameters)
+        self._follow(evaluation)
         gaussian = self.native(evaluation)
         if self.tilt is not None:
             tilt = self.tilt.factor(self.parameters, self._key)
@@ -577,14 +565,13 @@ class Problem:
                 gaussian.push_back(factor)
         return gaussian
 
-    def _follow(self, parameters: dict[str, Array]) -> None:
-        """Bind measurements anew that a clock has moved beyond their nodes."""
+    def _follow(self, evaluation: Evaluation) -> None:
+        """Take measurements to where they hang at an evaluation."""
         for block in self._blocks:
             for bound in block.bound:
-                at = bound.attached(parameters)
-                if not np.array_equal(at.node, bound.attachment.node):
-                    bound.time = bound.time + bound.late(parameters)
-                    bound.attachment = at
+                at = evaluation.attached[self._bound.index(bound)]
+                before, bound.attachment = bound.attachment, at
+                if before is None or not (at is before or np.array_equal(at.node, before.node)):
                     block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
 
     def _fill(self, evaluation: Evaluation) -> None:
@@ -620,6 +607,7 @@ class Problem:
 
         Unused ones are included: these are zero.
         """
+        self._follow(evaluation)
         for block in self._blocks:
             for bound in block.bound:
                 lin = self._linearized(bound, block.parameters, evaluation)
@@ -639,33 +627,32 @@ class Problem:
     ) -> Iterator[Rows]:
         """Yield the rows of the observations that depend on parameters, at values of these.
 
-        States, other parameters and weights are those of the evaluation. Measurements stay at
-        their nodes.
+        States, other parameters and weights are those of the evaluation.
 
         Parameters
         ----------
         evaluation : Evaluation
             Where the graph is linear but for these parameters.
         parameters : mapping of str to ndarray
-            Values of some parameters by name, rotations as matrices.
+            Values of some parameters by name, rotations as matrices; not of clocks.
         """
         other, values = copy(self), {**evaluation.parameters, **parameters}
-        found: dict[BoundObservation, BoundObservation] = {}
-        motions = []
-        for bound, motion in zip(self._bound, evaluation.motions, strict=True):
-            if not parameters.keys() & bound.names:
-                continue
-            own = bound.at(values) if parameters.keys() & bound.clocks else bound
-            if own is not bound or parameters.keys() & ERRORS.keys():
-                motion = own.motion(evaluation.states, values, own.late(values))
-            found[bound] = own
-            motions.append(motion)
-        other._bound = list(found.values())
+        seen = [i for i, bound in enumerate(self._bound) if parameters.keys() & bound.names]
+        attached, motions = (
+            [each[i] for i in seen] for each in (evaluation.attached, evaluation.motions)
+        )
+        other._bound = [self._bound[i] for i in seen]
+        if parameters.keys() & ERRORS.keys():
+            motions = [
+                bound.motion(at, evaluation.states, values)
+                for bound, at in zip(other._bound, attached, strict=True)
+            ]
         other._blocks = [
-            replace(block, bound=[found[each] for each in block.bound if each in found])
+            replace(block, bound=[each for each in block.bound if each in other._bound])
             for block in self._blocks
         ]
-        yield from other.observation_rows(replace(evaluation, parameters=values, motions=motions))
+        there = replace(evaluation, parameters=values, attached=attached, motions=motions)
+        yield from other.observation_rows(there)
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the whole problem for GTSAM's own optimisers, and values to start from.
@@ -690,8 +677,7 @@ class Problem:
         """
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
-        if self.chain.interpolates:
-            self._follow(self.arrays(self._weighed_at)[1])
+        self._follow(self.evaluate(self._weighed_at))
         return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
@@ -757,13 +743,8 @@ class Problem:
     def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
         return value_at(values, self._key[p.name], p)
 
-    def _bind(
-        self,
-        observation: Observation,
-        usable: BoolArray | None,
-        attached: Sequence[tuple[Array, Attachment]],
-    ) -> BoundObservation:
-        """Tie an observation to the chain, as others at the same times are."""
+    def _bind(self, observation: Observation, usable: BoolArray | None) -> BoundObservation:
+        """Tie an observation to the chain."""
         time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
         covered = self.chain.covers(time)
         if usable is not None:
@@ -771,30 +752,7 @@ class Problem:
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        out = BoundObservation(
-            observation, self.chain, None, time, covered, weight, self.clock_zero
-        )
-        before = ((b.time, b.attachment) for b in self._bound if b.turning == out.turning)
-        # Times that are not covered weigh nothing; they only need a place on the chain.
-        at = next((at for when, at in (*before, *attached) if np.array_equal(when, time)), None)
-        out.attachment = out.attached(self.bound_at) if at is None else at
-        return out
-
-    def needs_rebinding(self, parameters: dict[str, Array]) -> bool:
-        """Whether a clock has moved measurements too far from where they were bound.
-
-        Where the motion is known between nodes for all times alike, they are followed.
-        """
-        return not self.chain.interpolates and any(
-            self.chain.left(b.attachment, b.late(parameters), self._tolerance(b, SAME_TIME))
-            for b in self._bound
-        )
-
-    def _tolerance(self, bound: BoundObservation, least: float) -> float:
-        clock = bound.observation.clock
-        return (
-            least if clock is None else max(self.clock_tolerance.get(clock.names[0], 0.0), least)
-        )
+        return BoundObservation(observation, self.chain, None, covered, weight, self.clock_zero)
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""

@@ -7,7 +7,7 @@ one for a measurement.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
@@ -19,14 +19,14 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.native_graph import custom_factor
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.priors import prior_mean, value_at
 from factorgraph_dvl.imu.preintegration import Preintegration
-from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.imu.propagation import Attachment, States
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 
@@ -53,6 +53,8 @@ class NodeMeasurements:
     bound: tuple[BoundObservation, ...]
     parameters: tuple[Parameter, ...]
     fixed: Mapping[str, Array]
+    # What hangs at the times of the last evaluation.
+    _attached: dict[tuple[bytes, ...], list[Attachment]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -65,17 +67,38 @@ class NodeMeasurements:
         used = {name for b in bound for name in b.names}
         return cls(tuple(bound), tuple(p for p in estimated if p.name in used), fixed)
 
+    def attach(self, values: Mapping[str, Array]) -> list[Attachment]:
+        """Attach measurements by clocks as they are; those of one time share what they hang on.
+
+        Few times take as long as a single one: all at once.
+        """
+        times = [b.times(values) for b in self.bound]
+        when = tuple(time.tobytes() for time in times)
+        if when not in self._attached:
+            chain, count = self.bound[0].chain, 0
+            whole = chain.attach(np.concatenate(times))
+            found: dict[bytes, Attachment] = {}
+            for time in times:
+                found.setdefault(time.tobytes(), rows_of(whole, slice(count, count + time.size)))
+                count += time.size
+            self._attached.clear()
+            self._attached[when] = [found[each] for each in when]
+        out = self._attached[when]
+        if self.bound[0].errors is not None:
+            self.bound[0].errors.attach(out)
+        for b, at in zip(self.bound, out, strict=True):
+            b.attachment = at
+        return out
+
     def motions(self, states: States, values: Mapping[str, Array]) -> list[Motion]:
         """Return the motion at the true times of each kind; those of one time share it."""
         values = {**self.fixed, **values}
-        computed: dict[tuple[int, bytes], Motion] = {}
+        computed: dict[Attachment, Motion] = {}
         out = []
-        for b in self.bound:
-            late = b.late(values)
-            shared = id(b.attachment), late.tobytes()
-            if shared not in computed:
-                computed[shared] = b.motion(states, values, late)
-            out.append(computed[shared])
+        for b, at in zip(self.bound, self.attach(values), strict=True):
+            if at not in computed:
+                computed[at] = b.motion(at, states, values)
+            out.append(computed[at])
         return out
 
     def linearize(
@@ -141,10 +164,9 @@ def bind(
     observations: Sequence[Observation],
     parameters: Sequence[Parameter],
     key_of: Mapping[str, int],
-    values: Mapping[str, Array],
     clock_zero: float,
 ) -> tuple[list[BoundObservation], ImuErrors | None]:
-    """Tie what was measured in a chain to it, where clocks are as in `values`.
+    """Tie what was measured in a chain to it.
 
     Parameters
     ----------
@@ -156,8 +178,6 @@ def bind(
         Those that are estimated.
     key_of : mapping of str to int
         Their keys.
-    values : mapping of str to ndarray
-        Of all parameters, SI.
     clock_zero : float
         When the offsets of clocks hold, s.
 
@@ -168,22 +188,12 @@ def bind(
     errors : ImuErrors or None
         Errors of the IMU among the parameters.
     """
-    times = [time_on_chain(o, values, clock_zero, chain.clock) for o in observations]
-    # Attaching few times takes as long as attaching one: all at once.
-    whole = chain.attach(np.concatenate([*times, []]))
-    bound: list[BoundObservation] = []
-    count = 0
-    for o, time in zip(observations, times, strict=True):
-        # Of one sensor, such as position and velocity of GNSS.
-        same = bool(bound) and np.array_equal(time, bound[-1].time)
-        at = bound[-1].attachment if same else rows_of(whole, slice(count, count + time.size))
-        count += time.size
-        ones = np.ones((time.size, len(o.components)))
-        usable = np.ones(time.size, dtype=bool)
-        bound.append(BoundObservation(o, chain, at, time, usable, ones, clock_zero))
-    errors = chain.errors(parameters, key_of, [b.attachment for b in bound])
-    for b in bound:
-        b.errors = errors
+    errors = chain.errors(parameters, key_of)
+    bound = []
+    for o in observations:
+        count = o.time.size
+        usable, weight = np.ones(count, dtype=bool), np.ones((count, len(o.components)))
+        bound.append(BoundObservation(o, chain, None, usable, weight, clock_zero, errors))
     return bound, errors
 
 
@@ -354,35 +364,24 @@ def sensor_factor(
     fixed = {p.name: prior_mean(p) for p in parameters}
     free = tuple(p for p in parameters if p.name in keys)
     given = {**fixed, **{p.name: value_at(values, keys[p.name], p) for p in free}}
-    node, attachment = attached_rows(observation, chain, given, clock_zero)
+    node = nodes_before(observation, chain, given, clock_zero)
     (index,) = np.nonzero(node == k)
     if not index.size:
         raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
-    inertial = _inertial(chain)
-    time = time_on_chain(observation, given, clock_zero, None)[index]
-    local = replace(rows_of(attachment, index), node=np.zeros(index.size, dtype=int))
-    ones = np.ones((index.size, len(observation.components)))
-    bound = BoundObservation(
-        ObservationRows(observation, index),
-        inertial.from_node(k),
-        local,
-        time,
-        np.ones(index.size, dtype=bool),
-        ones,
-        clock_zero,
-    )
-    measured = NodeMeasurements((bound,), free, fixed)
+    some = ObservationRows(observation, index)
+    bound, _ = bind(_inertial(chain).from_node(k), [some], (), {}, clock_zero)
+    measured = NodeMeasurements(tuple(bound), free, fixed)
     states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
     weight = 1.0 / measured.sigma(measured.motions(states, given), given, {})
     shared = [keys[p.name] for p in free]
     return measurement_factor(measured, weight, keys["state"], keys["bias"], shared)
 
 
-def _inertial(chain: Preintegration) -> InertialChain:
+def _inertial(chain: Preintegration) -> ForwardChain:
     """Return the chain of a preintegration, without its factors."""
     biases = chain.imu.parameters(0.0)
     graph = gtsam.NonlinearFactorGraph()
-    return InertialChain(
+    return ForwardChain(
         chain.frame, chain.segments, chain.gravity_n, biases, biases, chain.imu.settings, graph
     )
 
@@ -419,15 +418,14 @@ def measured_nodes(
     [0, 1, 2, 3]
     """
     fixed = {p.name: prior_mean(p) for p in parameters}
-    node, _ = attached_rows(observation, chain, fixed, clock_zero)
+    node = nodes_before(observation, chain, fixed, clock_zero)
     return [int(k) for k in np.unique(node) if k >= 0]
 
 
-def attached_rows(
+def nodes_before(
     observation: Observation, chain: Preintegration, values: Mapping[str, Array], clock_zero: float
-) -> tuple[IntArray, Any]:
-    """Return the nodes before measurements (M,), -1 outside the chain, and their attachment."""
+) -> IntArray:
+    """Return the nodes before measurements (M,), -1 outside the chain."""
     time = time_on_chain(observation, values, clock_zero, None)
-    attachment = _inertial(chain).attach(time)
     inside = (time > chain.time[0] - _ROUNDING) & (time < chain.time[-1] + _ROUNDING)
-    return np.where(inside, attachment.node, -1), attachment
+    return np.where(inside, _inertial(chain).attach(time).node, -1)

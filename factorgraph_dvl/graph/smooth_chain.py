@@ -48,6 +48,9 @@ _FREE = np.repeat([np.pi, 1e5, 1e2, 1.0], 3)
 _BRANCH = 128
 # What rounding may add to a time, s.
 _ROUNDING = 1e-6
+# Share of the time between nodes by which a measurement may be beyond its own. Chosen: a clock
+# that is nearly known moves less.
+_STAYS = 0.05
 # Steps whose rows are made at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 
@@ -260,27 +263,38 @@ class SmoothChain:
         lag = 0.0 if self.clock is None else float(parameters[self.clock][0])
         return float(parameters[self.attitude_clock][0]) - lag - self.first_shift
 
-    def attach(self, time: Array, shift: float = 0.0, *, turning: bool = False) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+    def attach(
+        self,
+        time: Array,
+        shift: float = 0.0,
+        *,
+        turning: bool = False,
+        before: Attached | None = None,
+    ) -> Attached:
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
+
+        A measurement that is hardly beyond the nodes it had `before` keeps them: its attitude is
+        carried from other nodes than its position, so that the cost would jump there, by some
+        thousandths, and a minimisation would end at the jump.
+        """
         turned = time + shift
         by = turned if turning else time
         node = np.searchsorted(self.node_time, by, side="right") - 1
         node = np.clip(node, 0, self.count - 1)
+        if before is not None:
+            begin, end = self.node_time[before.node], self.node_time[before.node + 1]
+            slack = _STAYS * (end - begin)
+            node = np.where((by > begin - slack) & (by < end + slack), before.node, node)
         return Attached(node, node, time, turned)
 
-    def later(self, at: Attached, late: Array, shift: float = 0.0) -> Attached:
-        """Return an attachment at times that are later by (M,) s, to the same nodes."""
-        return replace(at, time=at.time + late, turned=at.time + late + shift)
-
-    def left(self, at: Attached, late: Array, tolerance: float) -> bool:
-        """Return False: where measurements are between nodes is followed."""
-        return False
-
-    def missing(self, at: Attached, lin: Linearization) -> Array:
+    def missing(self, at: Attached, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 
         Without it, a measurement would count for more the nearer to a node, and so draw clocks.
+        None for attitudes, by which the motion is known.
         """
+        if lin.d_p is None and lin.d_v is None and lin.d_omega is None:
+            return None
         begin, span = self.node_time[at.node], np.diff(self.node_time)[at.node]
         density, axes = self.density[at.node], self.nRt[at.node]
         out = np.zeros_like(lin.residual)
@@ -341,9 +355,7 @@ class SmoothChain:
         """Yield nothing: it has no parameters of its own."""
         yield from ()
 
-    def errors(
-        self, parameters: Sequence[Parameter], key_of: Mapping[str, int], at: Sequence[Attached]
-    ) -> None:
+    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
         """Return None: there is no IMU."""
 
     def trajectory(

@@ -56,8 +56,8 @@ class Partial:
     ----------
     phi : ndarray, shape (M, 3), rad
         Rotation vector.
-    dv : ndarray, shape (M, 3), m/s
-        Velocity increment in the axes at the start of the interval.
+    dv, dp : ndarray, shape (M, 3), m/s or m
+        Velocity and position increment in the axes at the start of the interval.
     omega, alpha, force : ndarray, shape (M, 3)
         Rate, its derivative, specific force at the end.
     omega_sigma : ndarray, shape (M, 3)
@@ -69,6 +69,7 @@ class Partial:
 
     phi: Array
     dv: Array
+    dp: Array
     omega: Array
     alpha: Array
     force: Array
@@ -148,42 +149,57 @@ class Increments(ArcPolynomials):
         dt = self.dt[index]
         u = since / dt
         phi, dv = integrate(c, dt, u)
+        dp = 0.5 * dv * since[:, None]
         if not rates:
             vectors, numbers = np.zeros((index.size, 3)), np.zeros(index.size)
-            return Partial(phi, dv, vectors, vectors, vectors, vectors, numbers, numbers)
-        omega, alpha, force = (np.empty((index.size, 3)) for _ in range(3))
+            return Partial(phi, dv, dp, vectors, vectors, vectors, vectors, numbers, numbers)
+        force = np.empty((index.size, 3))
+        time = self.start[index] + since
+        for mine, (_, forces) in self.by_arc(index):
+            if forces.spline is None:
+                force[mine] = evaluate(c[mine, :, 3:], u[mine])
+            else:
+                force[mine] = forces.spline(time[mine])
+        return Partial(phi, dv, dp, force=force, **self.rate_at(index, since))
+
+    def rate_at(self, index: IntArray, since: Array) -> dict[str, Array]:
+        """Return the rate after `since` seconds of intervals `index`, (M,).
+
+        With its derivative, and the standard deviations of both and of the force, as `Partial` has
+        them.
+        """
+        omega, alpha = np.empty((2, index.size, 3))
         # A step or a vibration leaves high differences, a smooth motion almost none; what
         # the gyro's noise accounts for is in its own standard deviation already.
         rough = np.abs(self.difference_at(index))
         noise = _BEYOND_NOISE * self.difference_sigma
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0
-        omega_sigma, alpha_sigma, force_sigma = (np.empty(index.size) for _ in range(3))
+        omega_sigma, alpha_sigma, force_sigma = np.empty((3, index.size))
         time = self.start[index] + since
-        for arc, (rate, forces) in enumerate(self.smoothed):
-            # Views of all are no copies.
-            alone = len(self.arcs) == 1
-            mine = slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc)
+        for mine, (rate, forces) in self.by_arc(index):
             omega_sigma[mine], alpha_sigma[mine] = rate.sigma, rate.slope_sigma
             force_sigma[mine] = forces.sigma
             if rate.spline is None:
-                omega[mine], alpha[mine] = self._blended_rate(index[mine], since[mine], c[mine])
+                omega[mine], alpha[mine] = self._blended_rate(index[mine], since[mine])
             else:
                 omega[mine], alpha[mine], misfit = rate.at(time[mine])
                 unresolved[mine] = np.hypot(unresolved[mine], misfit)
-            if forces.spline is None:
-                force[mine] = evaluate(c[mine, :, 3:], u[mine])
-            else:
-                force[mine] = forces.spline(time[mine])
-        return Partial(
-            phi=phi,
-            dv=dv,
-            omega=omega,
-            alpha=alpha,
-            force=force,
-            omega_sigma=np.hypot(omega_sigma[:, None], unresolved),
-            alpha_sigma=alpha_sigma,
-            force_sigma=force_sigma,
-        )
+        return {
+            "omega": omega,
+            "alpha": alpha,
+            "omega_sigma": np.hypot(omega_sigma[:, None], unresolved),
+            "alpha_sigma": alpha_sigma,
+            "force_sigma": force_sigma,
+        }
+
+    def by_arc(
+        self, index: IntArray
+    ) -> Iterator[tuple[slice | IntArray, tuple[Smoothed, Smoothed]]]:
+        """Yield which of intervals (M,) are in each arc, and its smoothed rate and force."""
+        for arc, signals in enumerate(self.smoothed):
+            # Views of all are no copies.
+            alone = len(self.arcs) == 1
+            yield slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc), signals
 
     @property
     def chosen_windows(self) -> tuple[int, int]:
@@ -243,12 +259,12 @@ class Increments(ArcPolynomials):
             ),
         )
 
-    def _blended_rate(self, index: IntArray, since: Array, c: Array) -> tuple[Array, Array]:
-        """Return rate and derivative, (M, 3), continuous from interval to interval.
+    def _blended_rate(self, index: IntArray, since: Array) -> tuple[Array, Array]:
+        """Return rate and derivative, (M, 3), which do not jump from interval to interval.
 
         Towards an end of its interval the polynomial gives way to the neighbour's, half and
-        half at the end itself. In smooth motion the two agree; at a step they do not, and a
-        time offset can only be found where the prediction does not jump.
+        half at the end itself, and not at all in its middle. In smooth motion the two agree; at a
+        step they do not, and a time offset can only be found where the prediction does not jump.
         """
         u = since / self.dt[index]
         near = np.where(u < 0.5, index - 1, index + 1)
@@ -256,11 +272,13 @@ class Increments(ArcPolynomials):
         near = np.where(self.arc_of[near] == self.arc_of[index], near, index)
         gap = np.where(near < index, self.dt[near], -self.dt[index])
         gap = np.where(near == index, 0.0, gap)
-        own, own_slope = rate_and_slope(c, since, self.dt[index])
+        own, own_slope = rate_and_slope(self.coefficients(index), since, self.dt[index])
         other, other_slope = rate_and_slope(self.coefficients(near), since + gap, self.dt[near])
-        inward = np.where(u < 0.5, 1.0, -1.0)
-        weight = np.clip(0.5 + np.where(u < 0.5, u, 1.0 - u), 0.0, 1.0)[:, None]
-        moving = ((weight > 0.0) & (weight < 1.0)) * (inward / self.dt[index])[:, None]
+        # From 0 at an end to 1 in the middle.
+        inward = np.clip(2.0 * np.minimum(u, 1.0 - u), 0.0, 1.0)[:, None]
+        weight = 0.5 + inward - 0.5 * inward**2
+        sign = np.where(u < 0.5, 2.0, -2.0) / self.dt[index]
+        moving = (1.0 - inward) * sign[:, None]
         return (
             weight * own + (1.0 - weight) * other,
             weight * own_slope + (1.0 - weight) * other_slope + moving * (own - other),

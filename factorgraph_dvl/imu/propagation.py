@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.imu.between_samples import between_samples
+from factorgraph_dvl.imu.increments import Partial
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
@@ -39,7 +41,7 @@ class States:
     accel_bias: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Attachment:
     """Where M measurement times hang on the chain, and the increments up to them.
 
@@ -86,6 +88,23 @@ def attach(seg: Segments, time: Array, earth_rate_n: Array, *, rates: bool = Tru
     return _attach(seg, *_inside(seg, time), earth_rate_n, rates=rates)
 
 
+def attach_smoothly(seg: Segments, time: Array, earth_rate_n: Array) -> tuple[Attachment, Array]:
+    """Attach times (M,) so that the motion has a continuous derivative in each of them.
+
+    Returns
+    -------
+    at : Attachment
+        Where the chain is nearest.
+    beyond : ndarray, shape (M,), s
+        How much later than there each time is: 0 where the chain covers it.
+    """
+    inc = seg.increments
+    index, since = _inside(seg, time)
+    inside = np.clip(since, 0.0, inc.dt[index])
+    beyond = since - inside
+    return _attach(seg, index, inside, earth_rate_n, smoothly=True), beyond
+
+
 def attach_with_ends(seg: Segments, time: Array, earth_rate_n: Array) -> Attachment:
     """Attach times (M,), and after them the ends of all segments to the nodes at their starts."""
     index, since = _inside(seg, time)
@@ -121,20 +140,31 @@ def segment_ends(seg: Segments, earth_rate_n: Array, *, rates: bool = True) -> A
 
 
 def _attach(
-    seg: Segments, index: IntArray, since: Array, earth_rate_n: Array, *, rates: bool = True
+    seg: Segments,
+    index: IntArray,
+    since: Array,
+    earth_rate_n: Array,
+    *,
+    rates: bool = True,
+    smoothly: bool = False,
 ) -> Attachment:
-    parts = [
-        _attach_some(seg, index[a : a + _CHUNK], since[a : a + _CHUNK], earth_rate_n, rates=rates)
-        for a in range(0, max(index.size, 1), _CHUNK)
-    ]
+    """Attach times `since` seconds after the start of intervals, some at a time."""
+    inc, parts = seg.increments, []
+    for a in range(0, max(index.size, 1), _CHUNK):
+        own = slice(a, a + _CHUNK)
+        part = (
+            between_samples(inc, index[own], since[own])
+            if smoothly
+            else inc.partial(index[own], since[own], rates=rates)
+        )
+        parts.append(_attach_some(seg, index[own], since[own], part, earth_rate_n))
     return parts[0] if len(parts) == 1 else concatenated(parts)
 
 
 def _attach_some(
-    seg: Segments, index: IntArray, since: Array, earth_rate_n: Array, *, rates: bool
+    seg: Segments, index: IntArray, since: Array, part: Partial, earth_rate_n: Array
 ) -> Attachment:
     inc = seg.increments
-    part = inc.partial(index, since, rates=rates)
     segment = seg.first.searchsorted(index, side="right") - 1
     node = seg.origin[segment]
     before = seg.since_start(index)
@@ -150,7 +180,7 @@ def _attach_some(
         dR=dR @ turned_by,
         dA=before.dA + dR @ (IDENTITY + 0.5 * skew(part.phi)) * h[:, :, None],
         dV=before.dV + turned,
-        dP=before.dP + before.dV * h + 0.5 * turned * h,
+        dP=before.dP + before.dV * h + rotate(dR, part.dp),
         gyro=part.omega,
         alpha=part.alpha,
         force=part.force,
@@ -195,7 +225,8 @@ class Transition:
         return self.at.turn @ self.states.nRb[self.at.node]
 
     @cached_property
-    def _increments(self) -> tuple[Array, Array, Array]:
+    def moved(self) -> tuple[Array, Array, Array]:
+        """Increments without what biases add, as of `with_bias`."""
         return self.increments or with_bias(self.at, self.states)
 
     @cached_property
@@ -209,7 +240,7 @@ class Transition:
     @cached_property
     def theta_theta(self) -> Array:
         """Attitude by attitude, (M, 3, 3)."""
-        return self._increments[0].transpose(0, 2, 1)
+        return self.moved[0].transpose(0, 2, 1)
 
     @cached_property
     def theta_gyro(self) -> Array:
@@ -224,7 +255,7 @@ class Transition:
     @cached_property
     def p_theta(self) -> Array:
         """Position by attitude."""
-        return -self.turned @ skew(self._increments[2])
+        return -self.turned @ skew(self.moved[2])
 
     @cached_property
     def p_p(self) -> Array:
@@ -250,7 +281,7 @@ class Transition:
     @cached_property
     def v_theta(self) -> Array:
         """Velocity by attitude."""
-        return -self.turned @ skew(self._increments[1]) - self._cross_rate @ self.p_theta
+        return -self.turned @ skew(self.moved[1]) - self._cross_rate @ self.p_theta
 
     @cached_property
     def v_v(self) -> Array:
@@ -266,23 +297,6 @@ class Transition:
     def v_accel(self) -> Array:
         """Velocity by accelerometer bias."""
         return -self.turned @ self.at.dA
-
-    @cached_property
-    def whole(self) -> Array:
-        """Attitude, position, velocity and rate by the node before, (M, 12, 15).
-
-        Columns: attitude, position, velocity, accelerometer bias, gyro bias.
-        """
-        out = np.zeros((self.at.tau.size, 12, 15))
-        out[:, 0:3, 0:3], out[:, 0:3, 12:15] = self.theta_theta, self.theta_gyro
-        out[:, 3:6, 0:3], out[:, 3:6, 3:6] = self.p_theta, self.p_p
-        out[:, 3:6, 6:9], out[:, 6:9, 6:9] = self.p_v, self.v_v
-        out[:, 3:6, 9:12], out[:, 3:6, 12:15] = self.p_accel, self.p_gyro
-        out[:, 6:9, 0:3] = self.v_theta
-        out[:, 6:9, 9:12], out[:, 6:9, 12:15] = self.v_accel, self.v_gyro
-        out[:, 9:12] = self.omega_theta @ out[:, 0:3]
-        out[:, 9:12, 12:15] -= IDENTITY
-        return out
 
 
 def attitude_jacobian(lin: Linearization, transition: Transition) -> Array | None:

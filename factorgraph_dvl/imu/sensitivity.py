@@ -15,10 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
-from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.between_samples import edge_signals, hermite
+from factorgraph_dvl.imu.preintegration import Integrals, Segments
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
+from factorgraph_dvl.imu.two_way import TwoWay, carried_back
 from factorgraph_dvl.sensors.imu import ERRORS, ImuError
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
@@ -103,9 +105,10 @@ def sensitivities(
         segment = [
             at.segment[own] - block.start for at, own in zip(attachments, rows, strict=True)
         ]
+        numbers = [_stride_of(seg, at, own) for at, own in zip(attachments, rows, strict=True)]
         places = [
-            strides.begins[inside] + _stride_of(seg, at, own)
-            for at, own, inside in zip(attachments, rows, segment, strict=True)
+            strides.begins[inside] + number
+            for inside, number in zip(segment, numbers, strict=True)
         ]
         for j in range(int(strides.count.max())):
             for place, inside, own, outs in zip(places, segment, rows, attached, strict=True):
@@ -119,13 +122,28 @@ def sensitivities(
             theta[live], v[live], p[live] = step
         for out, each in zip(whole, (-theta, v, p), strict=True):
             out[block] = each
-        for place, at, own, outs in zip(places, attachments, rows, attached, strict=True):
-            dR = strides.dR[place]
-            back = dR.transpose(0, 2, 1)
+        for place, number, at, own, outs in zip(
+            places, numbers, attachments, rows, attached, strict=True
+        ):
+            first = seg.first[at.segment[own]] + seg.stride * number
+            last = np.minimum(first + seg.stride, seg.last[at.segment[own]]) - 1
+            begin = _Edge(strides.dR[place], *edge_signals(seg.increments, first, after=False))
+            phi, length = strides.phi[place], strides.duration[place]
+            end = _Edge(begin.dR @ exp_so3(phi), *edge_signals(seg.increments, last, after=True))
             since = seg.node_time[at.node[own]] + at.tau[own] - strides.start[place]
-            dV = at.dV[own] - strides.dV[place]
-            means = _means(log_so3(back @ at.dR[own]), rotate(back, dV), since)
-            theta, v, p = _step(dR, means, errors, tuple(out[own] for out in outs))
+            before = tuple(out[own] for out in outs)
+            after = _step(begin.dR, _means(phi, strides.dv[place], length), errors, before)
+            values, _ = hermite(since / length, length)
+            theta, v, p = (
+                values[0] * one + values[1] * other + values[2] * slope + values[3] * next_slope
+                for one, other, slope, next_slope in zip(
+                    before,
+                    after,
+                    begin.slopes(before, errors),
+                    end.slopes(after, errors),
+                    strict=True,
+                )
+            )
             for out, each in zip(outs, (-theta, v, p), strict=True):
                 out[own] = each
     nothing = np.zeros((seg.first.size, 3))
@@ -144,47 +162,70 @@ def predicted(seg: Segments, ends: Sensitivity) -> Array:
     return np.concatenate([back @ ends.theta, back @ ends.p, back @ ends.v], axis=1)
 
 
-def moved(
-    seg: Segments,
-    at: Attachment,
-    bound: Attachment,
-    by: Sensitivity,
-    ends: Sensitivity,
-) -> Sensitivity:
-    """Return the sensitivity at M times that a clock has moved.
+def at_errors(by: Sensitivity, sizes: Array) -> Sensitivity:
+    """Return a sensitivity where errors have sizes (n,): a further one finds axes half turned."""
+    return replace(by, theta=by.theta + 0.5 * skew(by.theta @ sizes) @ by.theta)
 
-    What is integrated is interpolated between the start of the segment, the time where a
-    measurement was bound if that is in the same segment, and the end. So it does not jump where
-    a measurement moves into the segment before or after.
+
+def carried_back_by(at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sensitivity:
+    """Return the sensitivity of what is integrated back from the nodes after, in the axes there.
+
+    Of increments dR_Tᵀ dR, dR_Tᵀ (dV - dV_T) and so on, all up to the times and to the ends T.
 
     Parameters
     ----------
+    at : TwoWay
+        Where M times hang on the chain.
+    forward : Sensitivity
+        Of what is integrated up to the times.
+    ends : Sensitivity
+        The same up to the ends of all segments.
+    """
+    theta, v, p = (each[at.segment] for each in (ends.theta, ends.v, ends.p))
+    back = at.backward.dR @ np.ascontiguousarray(at.forward.dR.transpose(0, 2, 1))
+    turned = back @ theta
+    return replace(
+        forward,
+        theta=back @ forward.theta - turned,
+        v=back @ (forward.v - v) + skew(at.backward.dV) @ turned,
+        p=back @ (forward.p - p - at.backward.tau[:, None, None] * v)
+        + skew(at.backward.dP) @ turned,
+    )
+
+
+def corrected_two_way(
+    at: TwoWay,
+    by: Sensitivity,
+    ends: Sensitivity,
+    seg: Segments,
+    errors: Sequence[ImuError],
+    sizes: Array,
+) -> TwoWay:
+    """Return an attachment without errors of the IMU of given sizes (n,).
+
+    Parameters
+    ----------
+    at : TwoWay
+        Where M times hang on the chain.
+    by, ends : Sensitivity
+        As `forward` and `ends` of `carried_back_by`.
     seg : Segments
         Increments between the nodes.
-    at, bound : Attachment
-        Where the measurements are, and where they were bound.
-    by : Sensitivity
-        Where they were bound.
-    ends : Sensitivity
-        Of the increments over whole segments.
+    errors : sequence of ImuError
+        The n errors.
+    sizes : ndarray, shape (n,)
+        Of them.
     """
-    length = seg.increments.end[seg.last - 1] - seg.node_time[seg.origin]
-    whole = length[at.segment]
-    same = at.segment == bound.segment
-    knot = np.where(same, bound.tau, 0.0)
-    last = _share(at.tau - knot, whole - knot)
-    own = np.where(at.tau < knot, _share(at.tau, knot), 1.0 - last) * same
-    theta, v, p = (
-        own[:, None, None] * here + last[:, None, None] * end[at.segment]
-        for here, end in ((by.theta, ends.theta), (by.v, ends.v), (by.p, ends.p))
+    forward = corrected(at.forward, by, errors, sizes)
+    whole = Integrals(
+        dR=exp_so3(ends.theta @ sizes) @ seg.ends.dR,
+        dV=seg.ends.dV + ends.v @ sizes,
+        dP=seg.ends.dP + ends.p @ sizes,
+        dA=seg.ends.dA,
     )
-    return Sensitivity(theta, v, p, at.gyro, at.force)
-
-
-def _share(part: Array, whole: Array) -> Array:
-    """Return how much of a whole a part is, 0 to 1; 1 of nothing."""
-    share = np.divide(part, whole, out=np.ones_like(part), where=whole > 0.0)
-    return np.clip(share, 0.0, 1.0)
+    back = carried_back(whole, forward, at.backward)
+    # What biases do is left as it is, forward too: errors times biases are next to nothing.
+    return replace(at, forward=forward, backward=replace(back, dA=at.backward.dA))
 
 
 def corrected(
@@ -192,12 +233,15 @@ def corrected(
 ) -> Attachment:
     """Return an attachment without errors of the IMU of given sizes (n,)."""
     rate, force = added_by(by.gyro, by.force, errors, sizes)
+    # What the slope of the force adds is next to nothing.
+    alpha, _ = added_by(at.alpha, np.zeros_like(by.force), errors, sizes)
     return replace(
         at,
         dR=exp_so3(by.theta @ sizes) @ at.dR,
         dV=at.dV + by.v @ sizes,
         dP=at.dP + by.p @ sizes,
         gyro=at.gyro - rate,
+        alpha=at.alpha - alpha,
         force=at.force - force,
     )
 
@@ -262,6 +306,22 @@ class _Means:
     force: Array
     half: Array
     h: Array
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """Rotation (M, 3, 3) since the start of segments, rate and force (M, 3) there."""
+
+    dR: Array
+    rate: Array
+    force: Array
+
+    def slopes(self, at: tuple[Array, ...], errors: Sequence[ImuError]) -> tuple[Array, ...]:
+        """Return the time derivatives of Theta, V and P there."""
+        theta, v, _ = at
+        by_rate, by_force = unit_errors(self.rate, self.force, errors)
+        pushed = skew(rotate(self.dR, self.force)) @ theta - self.dR @ by_force
+        return self.dR @ by_rate, pushed, v
 
 
 def _means(phi: Array, dv: Array, h: Array) -> _Means:

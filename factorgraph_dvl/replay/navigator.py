@@ -15,8 +15,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import (
@@ -87,7 +87,7 @@ class _LinearizationPoint:
 class _Segment:
     """A segment as a chain of its own, and the epochs in it."""
 
-    chain: InertialChain
+    chain: ForwardChain
 
     @cached_property
     def epochs(self) -> Epochs:
@@ -252,7 +252,7 @@ class Navigator:
             self._refresh()
 
     def _bound(
-        self, chain: InertialChain, aids: Sequence[Aid]
+        self, chain: ForwardChain, aids: Sequence[Aid]
     ) -> tuple[NodeMeasurements | None, ImuErrors | None]:
         """Return what was measured in a segment, None if nothing, and errors of the IMU there."""
         start = self.start
@@ -260,9 +260,7 @@ class Navigator:
         for aid in aids:
             observations += aid.observations(start.frame, start.body_axes)
         own = self.smoother.calibration_keys
-        bound, errors = bind(
-            chain, observations, start.parameters, own, self.values, start.clock_zero
-        )
+        bound, errors = bind(chain, observations, start.parameters, own, start.clock_zero)
         if not bound:
             return None, errors
         return NodeMeasurements.of(bound, start.parameters, start.fixed), errors

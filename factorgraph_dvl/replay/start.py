@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
@@ -44,7 +45,7 @@ class ReplayStart:
 
     Parameters
     ----------
-    chain : InertialChain
+    chain : ForwardChain
         What the segments to come follow.
     body_axes : BodyAxes
         Axes of the body.
@@ -88,7 +89,7 @@ class ReplayStart:
         Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
-    chain: InertialChain
+    chain: ForwardChain
     body_axes: BodyAxes
     node: int
     time: float
@@ -205,7 +206,7 @@ def solve_start(
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
-        chain=chain,
+        chain=ForwardChain.of(chain),
         body_axes=trial.body_axes,
         node=last,
         time=time,

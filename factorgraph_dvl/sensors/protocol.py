@@ -46,6 +46,9 @@ class Motion:
     omega_sigma : ndarray, shape (M, 3), rad/s
         Standard deviation of omega_eb_b from the gyro's noise and from motion that its samples do
         not resolve.
+    turning_b, moving_n : ndarray, shape (M, 3), optional
+        By how much attitude and position change faster than omega_eb_b and v_n say, rad/s and m/s:
+        where two motions that differ are blended.
     """
 
     nRb: Array
@@ -55,6 +58,8 @@ class Motion:
     a_n: Array
     alpha_b: Array
     omega_sigma: Array
+    turning_b: Array | None = None
+    moving_n: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -311,14 +311,11 @@ def with_scattered_noise(
     """
     values = evaluation.parameters
     chain, observations, robust = problem.chain, problem.observations, problem.robust_weights
-    if block is None:
-        attached = problem.attached([slice(None)] * len(observations))
-    else:
+    if block is not None:
         own = [
             np.flatnonzero((at.segment >= block.start) & (at.segment < block.stop))
-            for at in problem.attachments
+            for at in evaluation.attached
         ]
-        attached = problem.attached(own, block.start)
         rows = {o.label: index for o, index in zip(observations, own, strict=True)}
         chain = chain.part(block)
         observations = tuple(
@@ -342,7 +339,6 @@ def with_scattered_noise(
         start=problem.bound_at,
         clock_zero=problem.clock_zero,
         processes=problem.processes,
-        attached=attached,
         tilt=tilt,
     )
     test.reject(problem.rejected)

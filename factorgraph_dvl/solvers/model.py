@@ -15,7 +15,13 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.levenberg_marquardt import CONVERGED, Minimum, factorized, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import (
+    CONVERGED,
+    Minimum,
+    factorized,
+    minimise,
+    quickly_factorized,
+)
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.statistics.marginal_likelihood import constants_of, restricted_objective
 
@@ -239,7 +245,6 @@ def minimised(
             stage="all sensors",
             progress=report,
             weighed=True,
-            binding=True,
             proven=not (rough or model.chain.interpolates),
             tolerance=_ROUGHLY if rough else CONVERGED,
         )
@@ -248,13 +253,12 @@ def minimised(
         moved = float(np.sqrt(np.mean((states.p_n - model.track) ** 2)))
         heavier = not model.chain.interpolates and moved > _SAME_GRAVITY
         lighter = problem.needs_reweighting(minimum.evaluation)
-        if not (heavier or lighter or problem.needs_rebinding(values)):
+        if not (heavier or lighter):
             break
         last, problem = problem, None
         if heavier:
             model = replace(model, chain=model.prepared.chain(states), track=states.p_n)
-        if heavier or lighter:
-            model = replace(model, reference=(states, values))
+        model = replace(model, reference=(states, values))
     return model, problem or last, replace(minimum, iterations=iterations)
 
 
@@ -293,7 +297,7 @@ def with_objective(
         # Where constants are at a maximum of their likelihood, the cost has none.
         evaluation = problem.weighed(problem.without_tilt(evaluation))
         tilt, problem.tilt = problem.tilt, None
-        information = factorized(problem, evaluation)[0]
+        information = (quickly_factorized if rough else factorized)(problem, evaluation)[0]
         problem.tilt = tilt
         model = replace(model, reference=(evaluation.states, evaluation.parameters))
     elif information is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,33 +10,46 @@ from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.priors import Tilt
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.statistics.marginal_likelihood import log_determinant_gradient
-from factorgraph_dvl.statistics.variance_components import (
-    VarianceComponents,
-    variance_components,
+from factorgraph_dvl.statistics.average_information import (
+    RestrictedScore,
+    SharedRows,
+    restricted_score,
 )
+from factorgraph_dvl.statistics.marginal_likelihood import (
+    by_place,
+    constants_of,
+    covariance_with_states,
+    leverage_of,
+    log_determinant_gradient,
+)
+from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR, LEAST_REDUNDANCY
 
-# Change of a logarithm from which on another estimate follows, and the largest of one estimate.
-# Chosen: less changes no σ that is shown.
-_SAME, _LARGEST = 0.1, 3.0
-# Ratio of two steps up to which they are extrapolated. Chosen: five steps in one.
-_MOST_RATIO = 0.8
+# Change of a logarithm, and fall of -2 log of the likelihood by it, from which on another estimate
+# follows. Chosen: less changes no σ that is shown; 0.7 of its own standard deviation. With 2 in
+# place of 0.5, two starts led to lever arms that were 0.2 standard deviations apart.
+_SAME, LEAST_GAIN = 0.2, 0.5
+# Largest change of one estimate. Chosen: the information holds near by.
+_LARGEST = 3.0
+# The same of one that goes to zero.
+_TO_ZERO = 6.0
 # Movement of the constants, in standard deviations, from which on another estimate follows.
 _SAME_CONSTANTS = 0.1
 # Longest step of the constants, in standard deviations of all together, that a gradient of the
 # log determinant is trusted for. Chosen: it holds over some of them.
 _TRUSTED = 3.0
-# Degrees of freedom below which a strength changes nothing else. Chosen: one.
-_FEWEST = 1.0
 # Least and largest densities, rad²/s³ and m²/s³. Chosen: the chain stays regular.
 _LEAST, _MOST = np.repeat([1e-14, 1e-10], 3), np.repeat([1.0, 1e2], 3)
 # Freedom of a prior at what was assumed, so that a class of few steps keeps its density.
 _PRIOR_FREEDOM = 1.0
+# The same of what a sensor states of its noise: right within a factor of three.
+_STATED_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 
 
 @dataclass(frozen=True)
@@ -57,8 +70,6 @@ class Strengths:
         Of the nodes of this chain.
     values : dict of str to ndarray
         Of all parameters, processes in their new unit.
-    steps : dict of str to ndarray
-        By strength, changes of the logarithms of its variances that residuals asked for.
     same : bool
         Whether all are about the same as before.
     """
@@ -69,15 +80,11 @@ class Strengths:
     tilt: Tilt
     states: SmoothStates
     values: dict[str, Array]
-    steps: dict[str, Array]
     same: bool
 
 
 def motion_strengths(
-    problem: Problem,
-    minimum: Minimum,
-    phase: IntArray,
-    before: Mapping[str, Array] | None = None,
+    problem: Problem, minimum: Minimum, phase: IntArray, least_gain: float = LEAST_GAIN
 ) -> Strengths:
     """Return strengths by restricted maximum likelihood, and the tilt that goes with them.
 
@@ -89,62 +96,120 @@ def motion_strengths(
         Where it ended.
     phase : ndarray of int, shape (K - 1,)
         What the heading does: accelerations have densities of their own in each phase.
-    before : mapping of str to ndarray, optional
-        `Strengths.steps` of the estimate before.
+    least_gain : float, optional
+        Fall of -2 log of the likelihood by one strength from which on another estimate follows.
     """
     chain = problem.chain
     assert isinstance(chain, SmoothChain)
     evaluation = problem.weighed(minimum.evaluation)
-    # Nothing holds the constants in what follows.
-    problem.tilt = None
     information = minimum.information
     step = information.solution()
-    found = variance_components(problem, evaluation, information)
-    wanted = _wanted(problem, found, phase)
-    steps = {
-        name: np.clip(_hastened(step, (before or {}).get(name)), -_LARGEST, _LARGEST)
-        for name, (step, _) in wanted.items()
-    }
-    factors = {
-        label: factor * np.exp(0.5 * steps[label])
-        for label, factor in problem.noise_factors.items()
-    }
+    strengths = _strengths_of(problem, phase)
+    score, gradient, covariance = _score(problem, evaluation, information, phase, strengths)
+    wanted, gain = _step(strengths, score)
+    factors = {label: factor.copy() for label, factor in problem.noise_factors.items()}
     density = chain.density.copy()
-    changed = {name: each * (left > _FEWEST) for name, (each, left) in wanted.items()}
-    for kind in np.unique(phase).tolist():
-        name = f"{chain.step_source} {kind}"
-        before_it = density[phase == kind][0]
-        after = np.clip(before_it * np.exp(steps[name]), _LEAST, _MOST)
-        density[phase == kind] = after
-        # At a bound, what is asked for beyond it changes nothing.
-        changed[name] = np.where(after == before_it, 0.0, changed[name])
-    processes, values = [], dict(evaluation.parameters)
+    sigma = {process.name: process.sigma.copy() for process in problem.processes}
+    kinds = {f"{chain.step_source} {kind}": phase == kind for kind in np.unique(phase).tolist()}
+    for i, s in enumerate(strengths):
+        own = list(s.components)
+        if s.name in kinds:
+            (component,) = s.components
+            before = density[kinds[s.name], component][0]
+            after = float(np.clip(before * np.exp(wanted[i]), _LEAST[component], _MOST[component]))
+            density[kinds[s.name], component] = after
+            # At a bound, what is asked for beyond it changes nothing.
+            wanted[i] = np.log(after / before)
+        elif s.name in factors:
+            before = factors[s.name][own[0]]
+            after = max(before * float(np.exp(0.5 * wanted[i])), LEAST_FACTOR)
+            factors[s.name][own] = after
+            wanted[i] = 2.0 * np.log(after / before)
+        else:
+            sigma[s.name][own] *= np.exp(0.5 * wanted[i])
+    values = dict(evaluation.parameters)
     for process in problem.processes:
-        if process.name in steps:
-            ratio = np.exp(0.5 * steps[process.name])
-            values[process.name] = values[process.name] / ratio
-            process = replace(process, sigma=process.sigma * ratio)
-        processes.append(process)
-    gradient = 0.5 * log_determinant_gradient(problem, evaluation, information)
-    every = {
-        problem.key(name): np.eye(gradient.size)[:, own] for name, own in problem.columns.items()
-    }
-    covariance = information.covariance_of([every]) if every else np.zeros((0, 0))
-    moved = np.concatenate([step.at(key) for key in every]) if every else np.zeros(0)
-    tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
-    same = max((float(np.abs(c).max()) for c in changed.values()), default=0.0) < 2.0 * _SAME
-    same = same and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
-    chain = replace(chain, density=density)
-    return Strengths(
-        chain,
-        factors,
-        tuple(processes),
-        tilt,
-        evaluation.states,
-        values,
-        {name: each for name, (each, _) in wanted.items()},
-        same,
+        ratio = sigma[process.name] / np.where(process.sigma > 0.0, process.sigma, 1.0)
+        nodes = values[process.name].copy()
+        nodes[:, : ratio.size] /= np.where(ratio > 0.0, ratio, 1.0)
+        values[process.name] = nodes
+    moved = np.concatenate(
+        [step.at(problem.key(name)) for name in problem.columns] or [np.zeros(0)]
     )
+    tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
+    other = (np.abs(wanted) > _SAME) & (gain > least_gain)
+    same = not other.any() and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
+    return Strengths(
+        chain=replace(chain, density=density),
+        factors=factors,
+        processes=tuple(replace(p, sigma=sigma[p.name]) for p in problem.processes),
+        tilt=tilt,
+        states=evaluation.states,
+        values=values,
+        same=same,
+    )
+
+
+def _score(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    phase: IntArray,
+    strengths: Sequence[_Strength],
+) -> tuple[RestrictedScore, Array, Array]:
+    """Return what residuals say of strengths, half the gradient of log det, and P of constants."""
+    constants = constants_of(problem)
+    columns = {
+        problem.key(name): np.eye(len(problem.prior_root))[:, own]
+        for name, own in problem.columns.items()
+    }
+    shared = list(_rows_of(problem, evaluation, phase, strengths))
+    observed = {o.label for o in problem.observations}
+    known = {(rows.source, rows.begin) for rows, _, _ in shared if rows.source in observed}
+    every = [rows for rows, _, _ in shared]
+    every += [r for r in problem.observation_rows(evaluation) if (r.source, r.begin) not in known]
+    with_states = covariance_with_states(every, information.given(constants), constants)
+    with_constants = information.covariance_with([columns])
+    covariance = np.zeros((len(problem.prior_root),) * 2)
+    for name, own in problem.columns.items():
+        covariance[own] = with_constants[problem.key(name)]
+    root = np.linalg.cholesky(np.linalg.inv(covariance))
+    parts = []
+    for (rows, number, share), with_own in zip(shared, with_states, strict=False):
+        h = leverage_of(rows, with_own, with_constants, root, constants)
+        parts.append(SharedRows(rows, number, np.broadcast_to(share, number.shape), h))
+    score = restricted_score(parts, len(strengths), information)
+    gradient = log_determinant_gradient(
+        problem, evaluation, information, by_place(every, with_states)
+    )
+    return score, 0.5 * gradient, covariance
+
+
+def _step(strengths: Sequence[_Strength], score: RestrictedScore) -> tuple[Array, Array]:
+    """Return the changes of logarithms of variances by their information, and what each gains.
+
+    That is the fall of -2 log of the likelihood, by the change of one alone.
+    """
+    stated = np.array([s.stated for s in strengths])
+    own = np.where(stated > 0.0, _STATED_FREEDOM, _PRIOR_FREEDOM)
+    squares = score.squares + own * np.where(stated > 0.0, stated, 1.0)
+    freedom = np.maximum(score.freedom, 0.0) + own
+    # What of the score a change leaves is squares exp(-change) - freedom where nothing but this
+    # variance is known, and there this is its change, however large.
+    slope = squares * np.log(squares / freedom)
+    bend = score.information + np.diag(squares - score.squares)
+    # What is smaller by far than stated is that of a record that was smoothed: see `LEAST_FACTOR`.
+    smoothed = (stated == 1.0) & (squares < LEAST_FACTOR**2 * freedom)
+    held = smoothed | ((stated > 0.0) & (score.freedom < LEAST_REDUNDANCY))
+    slope[held] = 0.0
+    bend[held], bend[:, held] = 0.0, 0.0
+    bend[held, held] = 1.0
+    change = np.clip(np.linalg.solve(bend, slope), -_LARGEST, _LARGEST)
+    # A variance that goes to zero does so along a line, its logarithm for ever.
+    plain = np.linalg.solve(bend, np.where(held, 0.0, squares - freedom))
+    weak = (plain < 0.0) & (2.0 * np.diag(bend) < squares)
+    change[weak] = np.log(np.maximum(1.0 + plain[weak], np.exp(-_TO_ZERO)))
+    return change, (squares - freedom) * change - 0.5 * np.diag(bend) * change**2
 
 
 def _next_tilt(
@@ -152,7 +217,8 @@ def _next_tilt(
 ) -> tuple[Tilt, Array]:
     """Return the tilt at some values, and the step of the parameters that it asks for, in σ.
 
-    The gradient holds near by: a longer step than `_TRUSTED` is held back.
+    The gradient holds near by: where it alone moves the parameters by more than `_TRUSTED`, they
+    are held back.
 
     Parameters
     ----------
@@ -166,43 +232,95 @@ def _next_tilt(
         Half that of the log determinant.
     """
     sigma = np.sqrt(np.diag(covariance))
-    moved = (step - covariance @ gradient) / np.maximum(sigma, 1e-300)
+    by_gradient = covariance @ gradient / np.maximum(sigma, 1e-300)
+    moved = step / np.maximum(sigma, 1e-300) - by_gradient
     correlation = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
     root = np.linalg.cholesky(correlation)
     inverse = np.asarray(solve_triangular(root, np.eye(sigma.size), lower=True))
-    far = float(np.linalg.norm(inverse @ moved))
+    far = float(np.linalg.norm(inverse @ by_gradient))
     hold = None
     if far > _TRUSTED:
         hold = np.sqrt(far / _TRUSTED - 1.0) * inverse / sigma
     return Tilt(gradient, sigma, dict(values), hold), moved
 
 
-def _wanted(
-    problem: Problem, found: VarianceComponents, phase: IntArray
-) -> dict[str, tuple[Array, Array]]:
-    """Return steps of the logarithms of variances and their freedom: noise, motion, processes."""
-    out = {}
-    for label, white in found.white.items():
-        step = 2.0 * np.log(white.factor / problem.noise_factors[label])
-        out[label] = step, white.redundancy
-    assert found.steps is not None
-    squares, freedom = ((each[:, :6] + each[:, 6:]) for each in found.steps)
+@dataclass(frozen=True)
+class _Strength:
+    """A variance that residuals may ask to change: of noise, of a motion, or of a process.
+
+    Parameters
+    ----------
+    name : str
+        Label of the noise, phase of the motion, or name of the process.
+    components : tuple of int
+        Which of its components have this variance.
+    stated : float, default 0
+        What a sensor states of it over what is assumed; 0 = nothing is stated.
+    """
+
+    name: str
+    components: tuple[int, ...]
+    stated: float = 0.0
+
+
+def _strengths_of(problem: Problem, phase: IntArray) -> list[_Strength]:
+    """Return the strengths of a problem: noise, motion, processes."""
+    out = []
+    groups = {o.label: o.noise_groups for o in problem.observations}
+    for label, factors in problem.noise_factors.items():
+        for group in groups[label]:
+            out.append(_Strength(label, group, 1.0 / float(factors[group[0]]) ** 2))
     for kind in np.unique(phase).tolist():
-        total, left = (each[phase == kind].sum(axis=0) for each in (squares, freedom))
-        left = np.maximum(left, 0.0)
-        ratio = (total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM)
-        out[f"{problem.chain.step_source} {kind}"] = np.log(ratio), left
+        out += [_Strength(f"{problem.chain.step_source} {kind}", (i,)) for i in range(6)]
     for process in problem.processes:
-        own = found.correlated.get(process.label)
-        if own is not None and not process.density_only:
-            out[process.name] = 2.0 * np.log(own.factor), own.redundancy
+        if process.density_only or not (process.label in problem.noise_factors or process.free):
+            continue
+        together = groups.get(process.label, (tuple(range(process.sigma.size)),))
+        out += [_Strength(process.name, group) for group in together]
     return out
 
 
-def _hastened(step: Array, before: Array | None) -> Array:
-    """Return steps of a fixed-point iteration that go where their ratio points (Aitken)."""
-    if before is None or before.shape != step.shape:
-        return step
-    known = np.abs(before) > _SAME
-    ratio = np.divide(step, before, out=np.zeros_like(step), where=known)
-    return np.asarray(step / (1.0 - np.clip(ratio, -1.0, _MOST_RATIO)))
+def _rows_of(
+    problem: Problem, evaluation: Evaluation, phase: IntArray, strengths: Sequence[_Strength]
+) -> Iterator[tuple[Rows, IntArray, Array]]:
+    """Yield the rows of strengths, which has each, and which share of its variance."""
+    number = {(s.name, c): i for i, s in enumerate(strengths) for c in s.components}
+    labels = [o.label for o in problem.observations]
+    own = _own_shares(problem, evaluation)
+    processes = {CORRELATED.format(p.label): p.name for p in problem.processes}
+    for rows in rows_by_source(problem, evaluation):
+        d = rows.vector.shape[1]
+        if rows.source == problem.chain.step_source:
+            kinds = phase[rows.begin : rows.begin + len(rows.vector)]
+            table = {
+                kind: [number[f"{rows.source} {kind}", i % 6] for i in range(d)]
+                for kind in np.unique(kinds).tolist()
+            }
+            yield rows, np.array([table[kind] for kind in kinds.tolist()]), np.ones(d)
+            continue
+        name = processes.get(rows.source, rows.source)
+        each = np.array([number.get((name, i), -1) for i in range(d)])
+        if not np.any(each >= 0):
+            continue
+        share = np.ones(d)
+        if rows.source in labels:
+            share = own[rows.source][rows.begin : rows.begin + len(rows.vector)]
+            long_run = problem.long_run.get(rows.source, 1.0)
+            rows = replace(rows, vector=rows.vector * long_run)
+        yield rows, np.broadcast_to(each, rows.vector.shape), share
+
+
+def _own_shares(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:
+    """Return the shares of the variance of measurements that are their own noise, by label."""
+    none = {o.label: np.zeros(len(o.components)) for o in problem.observations}
+    out = {}
+    for o, sigma, others, weight in zip(
+        problem.observations,
+        problem.sigma(evaluation),
+        problem.sigma(evaluation, none),
+        problem.weights,
+        strict=True,
+    ):
+        ratio = np.divide(others, sigma, out=np.ones(weight.shape), where=weight > 0.0)
+        out[o.label] = 1.0 - ratio**2
+    return out

@@ -97,6 +97,14 @@ class PlanarPreparation:
         """Return none: the current is constant."""
         return ()
 
+    @property
+    def noise_factors(self) -> Mapping[str, Array]:
+        """Return none: noise starts as stated."""
+        return {}
+
+    def first_tilt(self, values: Mapping[str, Array]) -> None:
+        """Return None: the volume of the states does not depend on the constants."""
+
     def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
         """Return None: how smooth the motion is, its records say."""
 

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import InertialChain, inertial_chain
+from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem, observed
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.increments import increments
@@ -67,6 +68,10 @@ class Prepared(Protocol):
         """Labels of the observations whose stated noise is only where to start."""
 
     @property
+    def noise_factors(self) -> Mapping[str, Array]:
+        """By label, factors (d,) on stated noise to start from, where they are known."""
+
+    @property
     def start_positions(self) -> StartPositions:
         """States to start from, one set for each position that the records allow."""
 
@@ -88,6 +93,9 @@ class Prepared(Protocol):
         self, chain: Any, states: Any, values: Mapping[str, Array]
     ) -> tuple[Process, ...]:
         """Return the processes that are in the problem from the start."""
+
+    def first_tilt(self, values: Mapping[str, Array]) -> Tilt | None:
+        """Return the gradient of the states' volume by the constants to start from."""
 
     def strengths(
         self, problem: Problem, minimum: Minimum, before: Strengths | None
@@ -136,6 +144,11 @@ class Preparation:
         """Times of measurements that are left out from the start, by label."""
         return self.start_positions.rejected
 
+    @property
+    def noise_factors(self) -> Mapping[str, Array]:
+        """Return none: noise starts as stated."""
+        return {}
+
     def start(self, chain: InertialChain, states: States, report: Progress) -> MountedStart:
         """Return where the minimisation with all sensors starts."""
         return mounted_start(self, chain, states, report)
@@ -145,6 +158,9 @@ class Preparation:
     ) -> tuple[Process, ...]:
         """Return none: noise is white until residuals show another one."""
         return ()
+
+    def first_tilt(self, values: Mapping[str, Array]) -> None:
+        """Return None: the volume of the states hardly depends on the constants."""
 
     def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
         """Return None: the IMU ties the nodes."""

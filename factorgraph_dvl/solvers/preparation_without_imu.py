@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.chain import Chain
-from factorgraph_dvl.graph.priors import prior_mean
+from factorgraph_dvl.graph.priors import Tilt, prior_mean
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
 from factorgraph_dvl.graph.smooth_chain import ChainStates, SmoothChain
@@ -33,7 +33,7 @@ from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.motion_strengths import Strengths, motion_strengths
+from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
@@ -101,6 +101,12 @@ class PreparationWithoutImu:
         Labels of the observations whose stated noise is only where to start.
     findings : tuple of Finding
         What the user must know.
+    noise_factors : mapping of str to ndarray, optional
+        By label, factors (d,) on stated noise to start from; by default none.
+    least_gain : float, optional
+        Gain of a strength from which on another estimate follows.
+    tilt : Tilt, optional
+        Where the minimisation starts; by default constants are held while states are found.
     """
 
     trial: Trial
@@ -114,6 +120,9 @@ class PreparationWithoutImu:
     processes: tuple[Process, ...]
     estimated_noise: frozenset[str]
     findings: tuple[Finding, ...]
+    noise_factors: Mapping[str, Array] = field(default_factory=dict)
+    least_gain: float = LEAST_GAIN
+    tilt: Tilt | None = None
 
     @property
     def start_positions(self) -> StartPositions:
@@ -139,10 +148,13 @@ class PreparationWithoutImu:
         problem.weigh(evaluation)
         return (*correlated_noise(problem, evaluation, ()).processes, *self.processes)
 
+    def first_tilt(self, values: Mapping[str, Array]) -> Tilt:
+        """Return the gradient of the states' volume by the constants to start from."""
+        return self.tilt or Tilt.holding(self.parameters, values)
+
     def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
-        steps = None if before is None else before.steps
-        found = motion_strengths(problem, minimum, self.phase, steps)
+        found = motion_strengths(problem, minimum, self.phase, self.least_gain)
         chain, values = found.chain, minimum.evaluation.parameters
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt
+from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
@@ -158,9 +157,7 @@ def _start(
         start = prepared.start(chain, states, report)
         states, values, iterations = start.states, start.values, start.iterations
         robust = start.robust_weights
-    tilt = None
-    if isinstance(chain, SmoothChain) and constants_prior is None:
-        tilt = Tilt.holding(prepared.parameters, values)
+    tilt = prepared.first_tilt(values) if constants_prior is None else None
     processes = prepared.stated_processes(chain, states, values)
     model = Model(
         prepared,
@@ -174,7 +171,8 @@ def _start(
             o.label: np.ones(len(o.components))
             for o in prepared.observations
             if o.label in prepared.estimated_noise and o.noise_groups
-        },
+        }
+        | dict(prepared.noise_factors),
         robust_weights=robust,
         rejected=prepared.rejected,
         tilt=tilt,

@@ -1,6 +1,6 @@
 """A stretch of a long trial without IMU, solved first: where the minimisation of all of it starts.
 
-Densities, noise and constants take ten estimates from nothing, and three or four from there.
+Densities, noise and constants take five estimates from nothing, and two from there.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from factorgraph_dvl.solvers.rounds import settle
 # the time so, and the stretch a quarter of that.
 _LENGTH = 1200.0
 _WORTH_IT = 2.5
+# Gain of a strength from which on the stretch asks for another estimate: all of the trial follows.
+_ROUGHLY = 3.0
 
 
 def started_from_stretch(
@@ -45,7 +47,7 @@ def started_from_stretch(
     first = int(inside[np.argmax(turns[last[inside]] - turns[inside])])
     trial = prepared.trial.until(time[last[first]], since=time[first])
     try:
-        part = prepare_without_imu(trial)
+        part = replace(prepare_without_imu(trial), least_gain=_ROUGHLY)
     except (ConfigError, DataError):
         # A sensor may be silent there.
         return prepared
@@ -61,6 +63,7 @@ def started_from_stretch(
         density[prepared.phase == kind] = found.chain.density[part.phase == kind][0]
     values = settled.minimum.evaluation.parameters
     strengths = {process.name: process.sigma for process in found.processes}
+    longer = (time[-1] - time[0]) / (time[last[first]] - time[first])
     return replace(
         prepared,
         first_chain=replace(chain, density=density),
@@ -68,4 +71,12 @@ def started_from_stretch(
         processes=tuple(
             replace(p, sigma=strengths.get(p.name, p.sigma)) for p in prepared.processes
         ),
+        tilt=None
+        if found.tilt is None
+        else replace(found.tilt, gradient=longer * found.tilt.gradient, origin=values, hold=None),
+        noise_factors={
+            label: factors
+            for label, factors in found.noise_factors.items()
+            if label in prepared.estimated_noise
+        },
     )

@@ -8,7 +8,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Rows
-from factorgraph_dvl.statistics.rows import add_transposed_product, product, with_own_covariance
+from factorgraph_dvl.statistics.rows import add_transposed_product, product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Random vectors, at most and at least, and their numbers in all. Chosen: one pass through the
@@ -51,23 +51,3 @@ def leverage(
     with_probes = information.covariance_with([sums])
     for each, z in zip(rows(), signs, strict=True):
         yield each, np.asarray(np.mean(z * product(each, with_probes), axis=2))
-
-
-def exact_leverage(
-    rows: Iterable[Rows], information: SquareRootInformation
-) -> Iterator[tuple[Rows, Array]]:
-    """Yield rows with their leverages (M, d): where few degrees of freedom are left of many.
-
-    The variables of an item must share a clique, as those of a factor of the graph do.
-
-    Parameters
-    ----------
-    rows : iterable of Rows
-        Of the graph.
-    information : SquareRootInformation
-        Information of the whole graph.
-    """
-    every = list(rows)
-    products = with_own_covariance([(each.keys, each.matrix) for each in every], information)
-    for each, with_own in zip(every, products, strict=True):
-        yield each, np.sum(with_own * each.matrix, axis=2)

@@ -51,7 +51,7 @@ Journal of the American Statistical Association 72(358), 1977.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -59,7 +59,7 @@ from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.statistics.rows import with_own_covariance
+from factorgraph_dvl.statistics.rows import product, with_own_covariance
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 from factorgraph_dvl.statistics.variance_components import log_prior
 
@@ -68,6 +68,10 @@ from factorgraph_dvl.statistics.variance_components import log_prior
 # gradient times the standard deviation.
 _STEP = 1e-3
 _LONGEST_STEP = 1e-6
+
+# Rows of observations and their covariance with their own states, by source and number of the
+# first item.
+WithStates = dict[tuple[str, int], tuple[Rows, Array]]
 
 
 def marginal_objective(
@@ -157,13 +161,16 @@ def _persisting(problem: Problem, evaluation: Evaluation) -> float:
 
 
 def log_determinant_gradient(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    with_states: WithStates | None = None,
 ) -> Array:
     """Return the gradient (P,) of log det of the states' information by the constants.
 
     At fixed states and weights, in the tangent space of the estimated parameters, SI, in the
-    order of `Problem.columns`. Zero by clocks where the motion is interpolated: it would be that
-    of the places of measurements between nodes, which mean nothing.
+    order of `Problem.columns`. Zero by clocks: it would be that of the places of measurements
+    between nodes, which mean nothing.
 
     Parameters
     ----------
@@ -173,6 +180,8 @@ def log_determinant_gradient(
         Where the graph is linear.
     information : SquareRootInformation
         From the elimination there, the constants last.
+    with_states : dict, optional
+        `by_place` of all rows of observations, where that is known.
     """
     constants = constants_of(problem)
     out = np.zeros(len(problem.prior_root))
@@ -181,24 +190,36 @@ def log_determinant_gradient(
     every = {problem.key(name): np.eye(out.size)[:, own] for name, own in problem.columns.items()}
     sigma = np.sqrt(np.diag(information.covariance_of([every])))
     steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
-    with_states = _covariance_with_states(
-        problem.observation_rows(evaluation), information.given(constants), constants
-    )
+    if with_states is None:
+        all_rows = list(problem.observation_rows(evaluation))
+        given = information.given(constants)
+        with_states = by_place(all_rows, covariance_with_states(all_rows, given, constants))
 
     def total(p: Parameter, value: Array) -> float:
         every = problem.observation_rows_at(evaluation, {p.name: value})
-        found = ((rows, with_states[rows.source, rows.begin]) for rows in every)
+        found = ((rows, with_states[rows.source, rows.begin][1]) for rows in every)
         return sum(float(np.vdot(_by_states(rows, constants), own)) for rows, own in found)
+
+    # By source: of the same rows, where the motion is that of the evaluation.
+    known: dict[str, float] = {}
+    for here, with_own in with_states.values():
+        total_here = float(np.vdot(_by_states(here, constants), with_own))
+        known[here.source] = known.get(here.source, 0.0) + total_here
+
+    def before(p: Parameter, value: Array) -> float:
+        if not problem.chain.interpolates:
+            return total(p, value)
+        return sum(known[b.observation.label] for b in problem.bound if p.name in b.names)
 
     clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
-        if problem.chain.interpolates and p.name in clocks:
+        if p.name in clocks:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
-        before = total(p, value)
+        at_value = before(p, value)
         for i, step in enumerate(np.diag(steps[own])):
             after = total(p, value @ exp_so3(step) if p.rotation else value + step)
-            out[own.start + i] = 2.0 * (after - before) / step[i]
+            out[own.start + i] = 2.0 * (after - at_value) / step[i]
     return out
 
 
@@ -217,15 +238,43 @@ def _by_states(rows: Rows, constants: set[int]) -> Array:
     return rows.matrix[:, :, : sum(rows.sizes[: _states_of(rows, constants)])]
 
 
-def _covariance_with_states(
-    every: Iterable[Rows], given: SquareRootInformation, constants: set[int]
-) -> dict[tuple[str, int], Array]:
-    """Return the covariance J P of rows with their own states given the constants, (M, d, n).
+def covariance_with_states(
+    every: Sequence[Rows], given: SquareRootInformation, constants: set[int]
+) -> list[Array]:
+    """Return the covariances J P of rows with their own states given the constants, (M, d, n)."""
+    parts = [
+        (rows.keys[:, : _states_of(rows, constants)], _by_states(rows, constants))
+        for rows in every
+    ]
+    return with_own_covariance(parts, given)
 
-    By source and number of the first item.
+
+def by_place(every: Sequence[Rows], with_states: Sequence[Array]) -> WithStates:
+    """Return rows with their `covariance_with_states` by source and number of the first item."""
+    return {(r.source, r.begin): (r, each) for r, each in zip(every, with_states, strict=True)}
+
+
+def leverage_of(
+    rows: Rows,
+    with_states: Array,
+    with_constants: Mapping[int, Array],
+    root: Array,
+    constants: set[int],
+) -> Array:
+    """Return the leverages (M, d) of rows, exact: by their states, and by the constants.
+
+    Parameters
+    ----------
+    rows : Rows
+        Of the graph.
+    with_states : ndarray, shape (M, d, n)
+        Their `covariance_with_states`.
+    with_constants : mapping of int to ndarray
+        Covariance (size, C) of every variable with the constants.
+    root : ndarray, shape (C, C)
+        Square root S of the information S Sᵀ on the constants.
+    constants : set of int
+        Their keys.
     """
-    places, parts = [], []
-    for rows in every:
-        places.append((rows.source, rows.begin))
-        parts.append((rows.keys[:, : _states_of(rows, constants)], _by_states(rows, constants)))
-    return dict(zip(places, with_own_covariance(parts, given), strict=True))
+    of_states = np.sum(with_states * _by_states(rows, constants), axis=2)
+    return np.asarray(of_states + np.sum((product(rows, with_constants) @ root) ** 2, axis=2))

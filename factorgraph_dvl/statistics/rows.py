@@ -96,20 +96,22 @@ def with_own_covariance(
     """
     place: dict[tuple[int, ...], int] = {}
     out = [np.zeros_like(matrix) for _, matrix in parts]
-    # What is not used need not be in the graph.
-    used = [np.flatnonzero(np.any(matrix, axis=(1, 2))) for _, matrix in parts]
-    number = [
-        np.array([place.setdefault(tuple(k), len(place)) for k in own[i].tolist()], dtype=int)
-        for (own, _), i in zip(parts, used, strict=True)
-    ]
-    for joint in information.joint_in_parts(list(place)):
-        known = np.zeros(len(place), dtype=bool)
-        known[list(joint)] = True
-        for (_, matrix), i, own, product_ in zip(parts, used, number, out, strict=True):
-            some = np.flatnonzero(known[own])
-            if some.size:
-                P = np.stack([joint[k] for k in own[some].tolist()])
-                product_[i[some]] = matrix[i[some]] @ P
+    # By part: numbers of groups in order, and the items that have them.
+    items = []
+    for own, matrix in parts:
+        # What is not used need not be in the graph.
+        used = np.flatnonzero(np.any(matrix, axis=(1, 2)))
+        groups = [place.setdefault(tuple(k), len(place)) for k in own[used].tolist()]
+        order = np.argsort(groups, kind="stable")
+        items.append((np.array(groups, dtype=int)[order], used[order]))
+    for found, P in information.joint_in_parts(list(place)):
+        for (_, matrix), (numbers, used), product_ in zip(parts, items, out, strict=True):
+            first = np.searchsorted(numbers, found)
+            count = np.searchsorted(numbers, found, side="right") - first
+            if count.any():
+                behind = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+                some = used[np.repeat(first, count) + behind]
+                product_[some] = matrix[some] @ np.repeat(P, count, axis=0)
     return out
 
 

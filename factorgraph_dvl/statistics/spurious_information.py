@@ -51,7 +51,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
         return out
     for observation, attachment, motion, weight in zip(
         problem.observations,
-        problem.attachments,
+        evaluation.attached,
         evaluation.motions,
         problem.weights,
         strict=True,
@@ -65,7 +65,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
             node = attachment.node[own]
             part = spurious_by(
                 some,
-                rows_of(attachment, own),
+                rows_of(attachment.forward, own),
                 rows_of(motion, own),
                 weight[own],
                 nodes,

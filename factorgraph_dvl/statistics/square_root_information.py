@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtrs
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 
 # Parts in which variables are eliminated. Chosen: GTSAM keeps all rows that went into a
@@ -245,25 +245,35 @@ class SquareRootInformation:
         Such variables share a clique: that of the one that was eliminated first.
         """
         out: list[Array] = [np.empty((0, 0))] * len(groups)
-        for found in self.joint_in_parts(groups):
-            for i, P in found.items():
+        for numbers, found in self.joint_in_parts(groups):
+            for i, P in zip(numbers.tolist(), found, strict=True):
                 out[i] = P
         return out
 
-    def joint_in_parts(self, groups: Sequence[tuple[int, ...]]) -> Iterator[dict[int, Array]]:
-        """Yield `joint_covariances` by number of the group, some at a time."""
+    def joint_in_parts(
+        self, groups: Sequence[tuple[int, ...]]
+    ) -> Iterator[tuple[IntArray, Array]]:
+        """Yield numbers (B,) of groups and their `joint_covariances` (B, n, n), some at a time."""
         wanted: dict[int, list[int]] = {}
         for i, group in enumerate(groups):
             wanted.setdefault(max(self._place[key] for key in group), []).append(i)
-        out: dict[int, Array] = {}
+        # Of cliques that look alike: numbers of groups, covariances of cliques, and components.
+        alike: dict[tuple[int, int], tuple[list[int], list[Array], Array]] = {}
+        count = 0
         for index, (_, place, P) in enumerate(self._joint()):
             for i in wanted.get(index, ()):
                 rows = self._components(place, groups[i])
-                out[i] = P[rows[:, None], rows]
-            if len(out) >= _AT_ONCE:
-                yield out
-                out = {}
-        yield out
+                kind = len(P), id(rows)
+                if kind not in alike:
+                    alike[kind] = [], [], rows
+                numbers, cliques, _ = alike[kind]
+                numbers.append(i)
+                cliques.append(P)
+                count += 1
+            if count >= _AT_ONCE:
+                yield from map(_selected, alike.values())
+                alike, count = {}, 0
+        yield from map(_selected, alike.values())
 
     def _components(self, place: Mapping[int, int], keys_: tuple[int, ...]) -> Array:
         """Return the components of variables among those of a clique: alike in most cliques."""
@@ -312,6 +322,12 @@ class SquareRootInformation:
                 if not children[parent]:
                     del joint[parent]
             yield clique, place, P
+
+
+def _selected(some: tuple[list[int], list[Array], Array]) -> tuple[IntArray, Array]:
+    """Return numbers, and components of the covariances of cliques that look alike."""
+    numbers, cliques, rows = some
+    return np.array(numbers), np.stack(cliques)[:, rows[:, None], rows]
 
 
 def eliminated(

@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.statistics.leverage import exact_leverage, leverage
+from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -23,7 +23,7 @@ _PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 # of its error.
 LEAST_FACTOR = 0.1
 # Redundancy below which no factor is estimated. Chosen: it would be uncertain by over 20 %.
-_LEAST_REDUNDANCY = 10.0
+LEAST_REDUNDANCY = 10.0
 # Groups of the components of a process that is of no observation.
 _TOGETHER = ((0, 1),)
 # Relative change of a factor from which on it counts, and in its own standard deviations.
@@ -50,7 +50,7 @@ class NoiseFactor:
     @classmethod
     def of(cls, squares: float, freedom: float) -> NoiseFactor:
         """Return the factor of one component from squares of its residuals and their freedom."""
-        if freedom < _LEAST_REDUNDANCY:
+        if freedom < LEAST_REDUNDANCY:
             return cls(np.ones(1), np.array([freedom]))
         found = np.sqrt((squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM))
         return cls(np.array([max(found, LEAST_FACTOR)]), np.array([freedom]))
@@ -72,13 +72,10 @@ class VarianceComponents:
         By label, factors on the standard deviations that sensors state.
     correlated : dict of str to NoiseFactor
         By label, factors on the innovations of correlated noise, relative to those assumed.
-    steps : tuple of ndarray, shape (K - 1, d), optional
-        Squares of the residuals from node to node, and what is left of their freedom.
     """
 
     white: dict[str, NoiseFactor]
     correlated: dict[str, NoiseFactor]
-    steps: tuple[Array, Array] | None = None
 
 
 def log_prior(noise_factors: Mapping[str, Array], observations: Iterable[Observation]) -> float:
@@ -126,30 +123,22 @@ def variance_components(
         Information there.
     """
     processes = {CORRELATED.format(p.label): p for p in problem.processes}
-    steps = problem.chain.step_source
-    wanted = {*problem.noise_factors, *processes, *((steps,) if steps else ())}
-    native = bool(processes) or steps is not None
-    source = partial(rows_by_source, problem) if native else problem.observation_rows
+    wanted = {*problem.noise_factors, *processes}
+    source = partial(rows_by_source, problem) if processes else problem.observation_rows
     count = sum(
         residual.size
         for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
         if o.label in wanted
     )
     count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
-    count += problem.chain.count * 12 * (steps is not None)
     found: dict[str, list[tuple[Array, Array]]] = {}
     estimated = partial(filter, lambda rows: rows.source in wanted)
-    with_leverage = (
-        leverage(lambda: estimated(source(evaluation)), count, information)
-        if steps is None
-        else exact_leverage(estimated(source(evaluation)), information)
-    )
-    for rows, h in with_leverage:
+    for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
         found.setdefault(rows.source, []).append((rows.vector, h))
     white = {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
         for label, parts in found.items()
-        if label not in processes and label != steps
+        if label not in processes
     }
     groups = {o.label: o.noise_groups for o in problem.observations}
     correlated = {
@@ -157,11 +146,7 @@ def variance_components(
         for source_name, p in processes.items()
         if p.label in problem.noise_factors or p.free
     }
-    of_steps = None
-    if steps is not None:
-        r, h = map(np.concatenate, zip(*found[steps], strict=True))
-        of_steps = r**2, 1.0 - h
-    return VarianceComponents(white, correlated, of_steps)
+    return VarianceComponents(white, correlated)
 
 
 def _innovations(
@@ -204,7 +189,7 @@ def _white(
         redundancy[group] = left
         total = float(squares[group] @ before[group] ** 2)
         found = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
-        if left < _LEAST_REDUNDANCY or (found < LEAST_FACTOR and before[group[0]] == 1.0):
+        if left < LEAST_REDUNDANCY or (found < LEAST_FACTOR and before[group[0]] == 1.0):
             factor[group] = before[group]
         else:
             # Not back to what is stated: that would come and go.

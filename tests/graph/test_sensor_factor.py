@@ -14,7 +14,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import InertialChain
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
@@ -46,7 +46,7 @@ def chain_of(imu, frame, seg, gravity_n):
     """The chain of a segment, without factors."""
     biases = imu.parameters(0.0)
     graph = gtsam.NonlinearFactorGraph()
-    return InertialChain(frame, seg, gravity_n, biases, biases, imu.settings, graph)
+    return ForwardChain(frame, seg, gravity_n, biases, biases, imu.settings, graph)
 
 
 def node_measurements(time=20.0, **changes):
@@ -81,7 +81,7 @@ def node_measurements(time=20.0, **changes):
     chain = chain_of(trial.imu, frame, seg, frame.gravity_without_rotation(middle))
     estimated = [p for p in parameters if p.estimated]
     some = {p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(estimated)}
-    bound, _ = bind(chain, observations, estimated, some, values, 0.0)
+    bound, _ = bind(chain, observations, estimated, some, 0.0)
     fixed = {p.name: values[p.name] for p in parameters if not p.estimated}
     measured = NodeMeasurements.of(bound, estimated, fixed)
     free = {p.name: values[p.name] for p in measured.parameters}
@@ -199,7 +199,7 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     estimated = [p for p in dvl.parameters() if p.estimated]
     fixed = {p.name: p.mean for p in dvl.parameters() if not p.estimated}
     mean = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in dvl.parameters()}
-    bound, _ = bind(chain, dvl.observations(frame, "RFU"), estimated, {}, mean, 0.0)
+    bound, _ = bind(chain, dvl.observations(frame, "RFU"), estimated, {}, 0.0)
     measured = NodeMeasurements.of(bound, estimated, fixed)
     rest = np.zeros((1, 3))
     states = States(np.eye(3)[None], rest, rest, rest, rest)

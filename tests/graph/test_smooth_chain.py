@@ -115,6 +115,49 @@ def test_the_clock_of_attitudes_leaves_these_where_they_are(prepared, problem):
             assert changed.max() > 1e-4
 
 
+def test_a_clock_that_moves_fixes_past_nodes_makes_no_jump(prepared):
+    """Value and slope of the cost go on where fixes pass their nodes by little."""
+    chain, start = prepared.first_chain, prepared.values
+    rng = np.random.default_rng(2)
+    states = prepared.states.retracted(rng.normal(0.0, 1e-3, (prepared.states.p_n.shape[0], 12)))
+
+    def bound_at(late):
+        values = start | {chain.clock: start[chain.clock] + late}
+        problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
+        for bound in problem.bound:
+            bound.attach(problem.prior_values() | values)
+        return problem
+
+    (fixes,) = (b for b in bound_at(0.0).bound if b.observation.unit == "m")
+    node_time = chain.node_time
+    to_node = node_time[fixes.attachment.node + 1] - fixes.attachment.time
+    # From here on, some fixes pass a node.
+    edge = float(to_node[to_node > 1e-3].min())
+    before, after = bound_at(edge - 1e-3), bound_at(edge + 1e-3)
+    steps = edge + 1e-3 * np.array([-0.5, -0.25, 0.25, 0.5])
+
+    def costs(problem):
+        found = []
+        for late in steps:
+            values = problem.prior_values() | start | {chain.clock: start[chain.clock] + late}
+            evaluation = problem.evaluate(problem.values(states, values))
+            found.append(evaluation.cost)
+        return np.array(found)
+
+    evaluation = before.evaluate(before.values(states, before.prior_values() | start))
+    before.weigh(evaluation)
+    after.weigh(evaluation)
+    for problem in (before, after):
+        cost = costs(problem)
+        slopes = np.diff(cost) / np.diff(steps)
+        # A straight line through four points, but for what bends it over a millisecond.
+        bend = cost[1:3].sum() - cost[[0, 3]].sum()
+        assert abs(bend) < 1e-6 * cost[0]
+        np.testing.assert_allclose(slopes, slopes[1], rtol=0.05)
+    # There is a jump between the two: by whose nodes the fixes go on.
+    assert np.abs(costs(before) - costs(after)).min() > 1e-6 * costs(before)[0]
+
+
 def test_what_is_missing_half_way_by_hand(prepared):
     chain, k = prepared.first_chain, 5
     start, dt = chain.node_time[k], chain.node_time[k + 1] - chain.node_time[k]
@@ -131,7 +174,9 @@ def test_what_is_missing_half_way_by_hand(prepared):
     assert missing("d_v") == pytest.approx(q[4] * dt / 16.0)
     assert missing("d_p") == pytest.approx(q[4] * dt**3 / 192.0)
     assert missing("d_omega") == pytest.approx(q[1] * dt / 16.0)
-    assert missing("d_theta") == pytest.approx(q[1] * dt**3 / 192.0)
+    assert missing("d_theta", "d_omega") == pytest.approx(q[1] * (dt**3 / 192.0 + dt / 16.0))
+    # Attitudes alone are those by which the motion is known.
+    assert chain.missing(at, Linearization(zero, d_theta=along["d_theta"])) is None
     # Half-way both are independent; at a third, tau² rest² (rest - tau) / 2 dt³ = 2/243 dt².
     every = missing("d_p", "d_v", "d_theta", "d_omega")
     assert every == pytest.approx((q[1] + q[4]) * (dt / 16.0 + dt**3 / 192.0))
@@ -143,7 +188,9 @@ def test_what_is_missing_half_way_by_hand(prepared):
     late = replace(late, node=at.node)
     assert missing("d_v", at=late) == pytest.approx(q[4] * dt / 16.0)
     assert missing("d_omega", at=late) == pytest.approx(2.0 * q[1])
-    assert missing("d_theta", at=late) == pytest.approx(8.0 / 3.0 * q[1])
+    both = missing("d_theta", "d_omega", at=late)
+    # Of 2 s: tau³ / 3 of the value, tau of its rate, and twice tau² / 2.
+    assert both == pytest.approx((8.0 / 3.0 + 2.0 + 4.0) * q[1])
 
 
 def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
@@ -151,14 +198,17 @@ def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
     clock = problem.chain.attitude_clock
     (ping,) = (b for b in problem.bound if b.observation.unit == "m/s")
     # Where the record begins nodes are elsewhere.
-    at_nodes = np.abs(ping.time[:, None] - problem.chain.node_time).min(axis=1) < 1e-9
-    assert at_nodes.sum() > ping.time.size - 4
+    time = ping.times(start)
+    at_nodes = np.abs(time[:, None] - problem.chain.node_time).min(axis=1) < 1e-9
+    assert at_nodes.sum() > time.size - 4
 
     def missing(late):
         parameters = start | {clock: start[clock] + late}
         evaluation = problem.evaluate(problem.values(prepared.states, parameters))
-        motion = evaluation.motions[problem.bound.index(ping)]
-        return ping.missing(motion, evaluation.parameters, problem.processes_of(ping))
+        at, motion = (
+            each[problem.bound.index(ping)] for each in (evaluation.attached, evaluation.motions)
+        )
+        return ping.missing(at, motion, evaluation.parameters, problem.processes_of(ping))
 
     # Attitudes of nodes are early by this.
     agreed = -problem.chain.shift(start)
@@ -195,7 +245,9 @@ def test_the_whole_graph_is_the_problem_also_where_clocks_have_moved(prepared, p
     problem.weigh(problem.evaluate(values))
     graph, start = problem.nonlinear_graph()
     evaluation = problem.evaluate(start)
-    assert max(np.abs(b.late(evaluation.parameters)).max() for b in problem.bound) > 0.02
+    bound = problem.bound_at
+    late = (b.times(evaluation.parameters) - b.times(bound) for b in problem.bound)
+    assert max(np.abs(each).max() for each in late) > 0.02
     ordering = problem.ordering()
     expected, _ = problem.linearize(evaluation).hessian(ordering)
     found, _ = graph.linearize(start).hessian(ordering)

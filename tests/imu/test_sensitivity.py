@@ -1,4 +1,4 @@
-"""Errors of the IMU: what they move, and what they move where a clock has moved."""
+"""Errors of the IMU: what they move, forward and back."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import pytest
 from problems import IMU_ERRORS, SHORT, problem_of
 from truth import scenario
 
-from factorgraph_dvl.imu.propagation import attach
-from factorgraph_dvl.imu.sensitivity import moved, sensitivities
+from factorgraph_dvl.geometry.rotations import log_so3
+from factorgraph_dvl.imu.sensitivity import carried_back_by, corrected_two_way, sensitivities
+from factorgraph_dvl.imu.two_way import attach_two_way
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 
@@ -23,39 +24,28 @@ def bound():
     return seg, rate, elements, seg.node_time[1:-2] + 0.03
 
 
-def at(bound, late):
+def test_what_is_integrated_back_moves_as_what_is_corrected(bound):
     seg, rate, elements, time = bound
-    here, there = attach(seg, time, rate), attach(seg, time + late, rate)
-    ends, (by, exact) = sensitivities(seg, elements, [here, there])
-    return moved(seg, there, here, by, ends), exact, ends
+    at = attach_two_way(seg, time + 0.4, rate)
+    ends, (by,) = sensitivities(seg, elements, [at.forward])
+    size = 1e-5 * np.random.default_rng(3).normal(size=len(elements))
+    back = carried_back_by(at, by, ends)
 
+    def corrected(factor):
+        return corrected_two_way(at, by, ends, seg, elements, factor * size).backward
 
-# What errors of the rate do to the position grows with the cube of time, from which a line between
-# its ends differs by at most 0.385 of the end.
-@pytest.mark.parametrize(
-    ("late", "share"), [(0.0, 1e-12), (0.001, 0.002), (0.02, 0.03), (-0.02, 0.03), (0.4, 0.385)]
-)
-def test_the_sensitivity_where_a_clock_moved_is_nearly_the_exact_one(bound, late, share):
-    found, exact, ends = at(bound, late)
-    for name in ("theta", "v", "p"):
-        mine, true = getattr(found, name), getattr(exact, name)
-        assert np.abs(mine - true).max() <= share * np.abs(getattr(ends, name)).max()
-    np.testing.assert_allclose(found.gyro, exact.gyro)
-    np.testing.assert_allclose(found.force, exact.force)
-
-
-def test_the_sensitivity_does_not_jump_from_segment_to_segment(bound):
-    seg, rate, elements, time = bound
-    here = attach(seg, time, rate)
-    before = attach(seg, time - 0.03 - 1e-5, rate)
-    assert np.all(before.segment == here.segment - 1)
-    ends, (by,) = sensitivities(seg, elements, [here])
-    found = moved(seg, before, here, by, ends)
-    # The node after takes over what the segment before has added.
-    whole = ends.theta[before.segment]
-    np.testing.assert_allclose(found.theta, whole, atol=2e-5 * np.abs(whole).max())
-    after = moved(seg, attach(seg, time - 0.03 + 1e-5, rate), here, by, ends)
-    assert np.abs(after.theta).max() < 1e-3 * np.abs(whole).max()
+    ahead, behind = corrected(1.0), corrected(-1.0)
+    turned = log_so3(ahead.dR @ behind.dR.transpose(0, 2, 1)) / 2.0
+    for found, name in (
+        (turned, "theta"),
+        ((ahead.dV - behind.dV) / 2.0, "v"),
+        ((ahead.dP - behind.dP) / 2.0, "p"),
+    ):
+        expected = getattr(back, name) @ size
+        np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    # Transposed, a rotation over half a second of a turn of 8 deg/s shows.
+    wrong = by.theta - ends.theta[at.segment]
+    assert np.abs((wrong - back.theta) @ size).max() > 1e-3 * np.abs(turned).max()
 
 
 def test_the_cost_does_not_jump_where_measurements_cross_a_node():
@@ -68,7 +58,7 @@ def test_the_cost_does_not_jump_where_measurements_cross_a_node():
         },
     )
     problem, values = problem_of(scene)
-    # Pings are bound where nodes are: with an earlier clock they belong to the segment before.
+    # Pings are where nodes are: with an earlier clock they belong to the segment before.
     (pings,) = (o.time for o in problem.observations if o.label == "DVL velocity")
     assert np.isin(problem.chain.segments.node_time[1:-1].round(6), pings.round(6)).all()
     at = minimise(problem, values, stage="test").evaluation

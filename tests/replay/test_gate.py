@@ -85,8 +85,10 @@ def bound_to(started, aids, seg):
     gravity = start.frame.gravity_without_rotation(p_n[None])
     chain = start.chain.following(seg, gravity, start.node)
     observations = [o for aid in aids for o in aid.observations(start.frame, start.body_axes)]
-    bound, _ = bind(chain, observations, start.parameters, {}, values, start.clock_zero)
-    return NodeMeasurements.of(bound, start.parameters, start.fixed)
+    bound, _ = bind(chain, observations, start.parameters, {}, start.clock_zero)
+    measured = NodeMeasurements.of(bound, start.parameters, start.fixed)
+    measured.attach(values)
+    return measured
 
 
 def test_measurements_of_one_time_share_the_motion_there(started):

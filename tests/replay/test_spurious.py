@@ -28,7 +28,7 @@ def second(started):
     observations = [
         o for aid in started.aids(seg) for o in aid.observations(start.frame, start.body_axes)
     ]
-    bound, _ = bind(chain, observations, start.parameters, {}, values, start.clock_zero)
+    bound, _ = bind(chain, observations, start.parameters, {}, start.clock_zero)
     measured = NodeMeasurements.of(bound, start.parameters, start.fixed)
     _, _, motions = measured.linearize(states, values)
     P = smoother.joint_covariance()[:9, :9]

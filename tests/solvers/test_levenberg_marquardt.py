@@ -42,19 +42,6 @@ def test_a_cost_that_is_not_finite_is_refused():
         minimise(problem, values, stage="test")
 
 
-def test_it_stops_early_where_another_problem_follows(monkeypatch):
-    problem, values = problem_of(scenario(manoeuvres=SHORT))
-    whole = minimise(problem, values, stage="test")
-    monkeypatch.setattr(problem, "needs_rebinding", lambda _: True)
-    assert minimise(problem, values, stage="test").converged
-    minimum = minimise(problem, values, stage="test", binding=True)
-    assert not minimum.converged
-    assert minimum.square_root is None
-    assert minimum.iterations <= whole.iterations
-    # What is left is less than 0.14 sigma in all.
-    assert 0.0 <= minimum.evaluation.cost - whole.evaluation.cost < 1e-2
-
-
 class AtAKink:
     """Lowest cost at 0, where a linear model promises to lower it further."""
 
@@ -67,9 +54,6 @@ class AtAKink:
 
     def weighed(self, evaluation):
         return evaluation
-
-    def needs_rebinding(self, parameters):
-        return False
 
     def linearize(self, evaluation):
         graph = gtsam.GaussianFactorGraph()

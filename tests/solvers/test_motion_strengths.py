@@ -70,9 +70,12 @@ def test_the_noise_is_found(settled):
 def test_a_density_at_its_bound_changes_no_more(settled, monkeypatch, at_bound):
     """Residuals may ask for less for ever: another estimate would be the same."""
     problem, density = settled.problem, settled.problem.chain.density
-    as_it_is = {label: (0.0 * f, 100.0 + 0.0 * f) for label, f in problem.noise_factors.items()}
-    less = {f"{problem.chain.step_source} 0": (-np.ones(6), np.full(6, 100.0))}
-    monkeypatch.setattr(motion_strengths, "_wanted", lambda *_: as_it_is | less)
+
+    def less(strengths, score):
+        wanted = np.array([-1.0 * s.name.endswith(" 0") for s in strengths])
+        return wanted, 100.0 * np.abs(wanted)
+
+    monkeypatch.setattr(motion_strengths, "_step", less)
     if at_bound:
         monkeypatch.setattr(motion_strengths, "_LEAST", density[0])
     phase = np.zeros(len(density), dtype=int)

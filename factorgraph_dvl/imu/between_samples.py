@@ -1,0 +1,85 @@
+"""Motion between the samples of an IMU, whose derivative does not jump where one ends.
+
+At the edges of its intervals the motion is that of the samples, and its slope the smoothed rate
+and force: a clock that moves a time over a sample finds no jump, and not the noise of the sample.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array, IntArray, cross, rotate
+from factorgraph_dvl.imu.increments import Increments, Partial
+
+
+def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
+    """Return the motion `since` seconds after the start of intervals `index`, (M,).
+
+    Cubics of Hermite between the edges of the interval, in the axes at its start. The specific
+    force is that of the cubic.
+    """
+    (rate, force), (rate_after, force_after) = (
+        edge_signals(inc, index, after=after) for after in (False, True)
+    )
+    phi, dv = inc.over(index)
+    dt = inc.dt[index]
+    values, slopes = hermite(since / dt, dt)
+    across = cross(phi, rate_after)
+    # Rotation vectors turn by Jr^-1(phi) rate.
+    rate_after = rate_after + 0.5 * across + cross(phi, across) / 12.0
+    force_after = rotate(exp_so3(phi), force_after)
+    phi_at = _cubic(values, phi, rate, rate_after)
+    return Partial(
+        phi=phi_at,
+        dv=_cubic(values, dv, force, force_after),
+        dp=_cubic(values, 0.5 * dv * dt[:, None], np.zeros_like(dv), dv),
+        force=rotate(exp_so3(-phi_at), _cubic(slopes, dv, force, force_after)),
+        **inc.rate_at(index, since),
+    )
+
+
+def hermite(u: Array, length: Array) -> tuple[Array, Array]:
+    """Return weights (4, M, 1, 1) of values and slopes at both ends of steps, in a cubic.
+
+    Of its value at shares u (M,) of steps of some lengths, and of its derivative.
+    """
+    v = 1.0 - u
+    last, change = u**2 * (3.0 - 2.0 * u), 6.0 * u * v / length
+    return (
+        np.array([1.0 - last, last, length * u * v**2, -length * u**2 * v])[..., None, None],
+        np.array([-change, change, v * (1.0 - 3.0 * u), u * (3.0 * u - 2.0)])[..., None, None],
+    )
+
+
+def _cubic(weights: Array, *parts: Array) -> Array:
+    """Return the cubic with a value of 0 before, a value after, and slopes, (M, 3) each."""
+    return np.asarray(sum(w[:, :, 0] * part for w, part in zip(weights[1:], parts, strict=True)))
+
+
+def edge_signals(inc: Increments, index: IntArray, *, after: bool) -> Array:
+    """Return rate and force at the edges before or after intervals (M,), (2, M, 3)."""
+    time = inc.start[index] + (inc.dt[index] if after else 0.0)
+    out = np.empty((2, index.size, 3))
+    for mine, signals in inc.by_arc(index):
+        raw: Array | None = None
+        for i, signal in enumerate(signals):
+            if signal.spline is not None:
+                out[i, mine] = signal.spline(time[mine])
+                continue
+            raw = _raw_edge(inc, index[mine], after=after) if raw is None else raw
+            out[i, mine] = raw[:, 3 * i : 3 * i + 3]
+    return out
+
+
+def _raw_edge(inc: Increments, index: IntArray, *, after: bool) -> Array:
+    """Return rate and force (M, 6) at edges: half-way between the polynomials on both sides."""
+    near = np.clip(index + (1 if after else -1), 0, inc.dt.size - 1)
+    near = np.where(inc.arc_of[near] == inc.arc_of[index], near, index)
+    own, other = inc.coefficients(index), inc.coefficients(near)
+    # A polynomial's value is its first coefficient at the start, the sum of all at the end.
+    at_start, at_end = (own, other) if not after else (other, own)
+    first, last = at_start[:, 0], at_end.sum(axis=1)
+    alone = (near == index)[:, None]
+    own_edge = last if after else first
+    return np.where(alone, own_edge, 0.5 * (first + last))
