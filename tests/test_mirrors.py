@@ -34,6 +34,7 @@ ELSEWHERE = {
     "graph/imu_errors": "graph/test_problem.py",
     "graph/observation_rows": "sensors/test_protocol.py",
     "graph/processes": "solvers/test_correlated_noise.py",
+    "imu/between_samples": "imu/test_two_way.py",
     "imu/attitude_record": "solvers/test_preparation_without_imu.py",
     "initialization/record_clocks": "solvers/test_preparation_without_imu.py",
     "initialization/track_velocity": "solvers/test_preparation_without_imu.py",

@@ -96,6 +96,7 @@ class BoundObservation:
     def __post_init__(self) -> None:
         # Until it is known that it does not.
         self._sees_motion = True
+        self._recorded: Linearization | None = None
 
     def single(self, i: int) -> BoundObservation:
         """Return a measurement by itself, as if the nodes around it were the first two."""
@@ -177,7 +178,11 @@ class BoundObservation:
         """
         if not self._sees_motion:
             return None
-        lin = self.linearized(motion, parameters, (), processes)
+        lin = self._recorded
+        if lin is None:
+            lin = self.linearized(motion, parameters, (), processes)
+            # How long derivatives by a motion that is recorded are does not change.
+            self._recorded = None if self.chain.interpolates else lin
         missing = self.chain.missing(at, lin)
         self._sees_motion = missing is not None
         return missing

@@ -19,6 +19,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 from factorgraph_dvl.statistics.variance_components import NoiseFactor
 
 IMU_NOISE = (GYRO_NOISE, ACCEL_NOISE)
+# Segments from which the noise is estimated. Chosen: it is then known to some per cent.
+_SEGMENTS = 500
 # Keys of the settings that state each of them.
 _KEYS = {GYRO_NOISE: "gyro_noise_deg_sqrt_h", ACCEL_NOISE: "accel_noise_ug_sqrt_hz"}
 
@@ -28,6 +30,7 @@ def squares_of(
     evaluation: Evaluation,
     information: SquareRootInformation,
     sources: Iterable[str],
+    every: int = 1,
 ) -> dict[str, tuple[float, float]]:
     """Return the squares of residuals by source, and what they are by chance.
 
@@ -41,11 +44,13 @@ def squares_of(
         Information there.
     sources : iterable of str
         Of native factors.
+    every : int, default 1
+        Of so many factors one is taken.
     """
     wanted = set(sources)
 
     def rows() -> Iterator[Rows]:
-        return (r for r in native_rows(problem, evaluation) if r.source in wanted)
+        return (r for r in native_rows(problem, evaluation, every) if r.source in wanted)
 
     squares, freedom = dict.fromkeys(sorted(wanted), 0.0), dict.fromkeys(sorted(wanted), 0.0)
     count = 0
@@ -70,7 +75,8 @@ def lower_noise(problem: Problem, minimum: Minimum) -> dict[str, float]:
     minimum : Minimum
         Where it ended.
     """
-    found = squares_of(problem, minimum.evaluation, minimum.information, IMU_NOISE)
+    every = max(problem.chain.count // _SEGMENTS, 1)
+    found = squares_of(problem, minimum.evaluation, minimum.information, IMU_NOISE, every)
     out = {}
     for source, (squares, freedom) in found.items():
         factor = float(NoiseFactor.of(squares, freedom).after(np.ones(1))[0])

@@ -127,8 +127,18 @@ def _by_variable(rows: Rows) -> Iterator[tuple[IntArray, Array]]:
         yield rows.keys[:, i], rows.matrix[:, :, edges[i] : edges[i + 1]]
 
 
-def native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
-    """Yield the rows of the factors that GTSAM linearises itself, some of one source together."""
+def native_rows(problem: Problem, evaluation: Evaluation, every: int = 1) -> Iterator[Rows]:
+    """Yield the rows of the factors that GTSAM linearises itself, some of one source together.
+
+    Parameters
+    ----------
+    problem : Problem
+        With weights.
+    evaluation : Evaluation
+        Where the graph is linear.
+    every : int, default 1
+        Of so many factors one is taken, from the first on.
+    """
     yield from problem.chain_rows(evaluation)
     gaussian = problem.native(evaluation)
     sizes = evaluation.values.dims()
@@ -136,7 +146,7 @@ def native_rows(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     of_chain = ", ".join(p.name for p, _, _ in problem.chain.mean_constants(evaluation.states))
     names |= {p.key(j): p.label for p in problem.processes for j in range(p.time.size)}
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
-    for i in range(gaussian.size()):
+    for i in range(0, gaussian.size(), every):
         factor = gaussian.at(i)
         own = list(factor.keys())
         kind = (_source(own, names, of_chain), tuple(sizes[key] for key in own))
