@@ -50,15 +50,15 @@ class ForwardChain(InertialChain):
         at, beyond = attach_smoothly(self.segments, time, rate)
         return later(at, beyond, rate) if beyond.any() else at
 
-    def missing(self, at: Attachment, lin: Linearization) -> None:
+    def missing(self, at: Any, lin: Linearization) -> None:
         """Return None: the noise since the node is left out."""
         return
 
-    def motion(self, at: Attachment, states: States) -> Motion:
+    def motion(self, at: Any, states: States) -> Motion:
         """Return the motion at M attached times, carried from the nodes before."""
         return motion_at(at, states, self.gravity_n, self.frame.earth_rate)
 
-    def transition(self, at: Attachment, states: States, motion: Motion) -> Any:
+    def transition(self, at: Any, states: States, motion: Motion) -> Any:
         """Return the derivatives of the motion at attached times by the nodes before."""
         return Transition(at, states, motion, self.frame.earth_rate)
 

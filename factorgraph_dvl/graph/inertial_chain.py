@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import gtsam
 import numpy as np
@@ -152,7 +152,7 @@ class InertialChain:
         Up to what no factor on the noise of gyros or accelerometers changes.
         """
         imu = self.imu
-        noise = np.log([imu.gyro_noise_deg_sqrt_h, imu.accel_noise_ug_sqrt_hz])
+        noise = np.log([imu.gyro_noise_root_psd, imu.accel_noise_root_psd])
         walks = float(np.log(self.bias_steps).sum()) if self.walking else 0.0
         return 2.0 * (self.count * float(noise @ [3.0, 6.0]) + walks)
 
@@ -204,7 +204,7 @@ class InertialChain:
         """Return the states that measurements after node k depend on: its own, and the next."""
         return self._states(values, range(k, k + 2))
 
-    def from_node(self, k: int) -> InertialChain:
+    def from_node(self, k: int) -> Self:
         """Return what carries the motion from node k to the next, which then are the first two."""
         seg = self.segments
         i = int(np.searchsorted(seg.origin, k))
@@ -424,7 +424,7 @@ class InertialChain:
         vars(out)["zeros"] = self.zeros
         return out
 
-    def following(self, seg: Segments, gravity_n: Array, first: int) -> InertialChain:
+    def following(self, seg: Segments, gravity_n: Array, first: int) -> Self:
         """Return the chain of other segments, such as the next one: its nodes begin at `first`."""
         graph = gtsam.NonlinearFactorGraph()
         out = replace(self, segments=seg, gravity_n=gravity_n, graph=graph)
