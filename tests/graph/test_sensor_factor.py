@@ -27,6 +27,7 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import one_segment, preintegrate
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 
@@ -39,6 +40,14 @@ FREE = {
         "reference": "water",
     },
     "gnss": {"lever_arm_std_m": [0.1, 0.1, 0.1]},
+}
+ERRORS_FREE = FREE | {
+    "imu": {
+        "gyro_scale_std_ppm": 300,
+        "accel_scale_std_ppm": 300,
+        "gyro_misalignment_std_deg": 0.03,
+        "accel_misalignment_std_deg": 0.03,
+    }
 }
 
 
@@ -118,8 +127,11 @@ def test_the_factor_has_no_error_at_the_truth():
     assert np.abs(factor.unwhitenedError(gtsam_values(measured, turned, values))).max() > 1.0
 
 
-def test_the_factor_linearises_as_differences_do():
-    measured, states, values = node_measurements(trial=FREE)
+@pytest.mark.parametrize("claims", [FREE, ERRORS_FREE], ids=["sensors", "imu"])
+def test_the_factor_linearises_as_differences_do(claims):
+    measured, states, values = node_measurements(trial=claims)
+    own = {p.name for p in measured.parameters} & ERRORS.keys()
+    assert bool(own) == ("imu" in claims)
     rng = np.random.default_rng(3)
     states = replace(
         states,
@@ -129,7 +141,8 @@ def test_the_factor_linearises_as_differences_do():
         accel_bias=states.accel_bias + 1e-2,
     )
     for p in measured.parameters:
-        step = rng.normal(0.0, 1e-5 if p.spec.unit == "s" else 0.1, p.mean.size)
+        small = 1e-4 if p.name in own else 1e-5 if p.spec.unit == "s" else 0.1
+        step = rng.normal(0.0, small, p.mean.size)
         value = values[p.name]
         values[p.name] = value @ exp_so3(step) if p.rotation else value + step
     at = gtsam_values(measured, states, values)
