@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 import factorgraph_dvl as fd
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.verdict import Grade, grades, verdict_of
-from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.sensors.imu import Imu
 
 SHORT_RUN = Path(__file__).parent / "short.yaml"

@@ -149,7 +149,7 @@ class Solution(Judged):
     >>> solution
     <Solution of 'short run' by batch: good, 9 parameters>
     >>> print(solution.summary().splitlines()[5])
-    scale_error       0.00523 ± 0.00036          green
+    scale_error       0.00521 ± 0.00036          green
     >>> solution.covariance.shape == 2 * (len(solution.order),)
     True
     """

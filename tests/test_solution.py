@@ -53,7 +53,7 @@ def test_summary_and_html_have_every_component(solution):
         assert "good" in text
         for name in ("misalignment_z", "scale_error", "lever_arm_x", "dvl_bias_z"):
             assert name in text
-        assert "19.996 ± 0.021" in text
+        assert "19.997 ± 0.021" in text
     assert max(map(len, solution.summary().splitlines())) <= 80
 
 
@@ -155,7 +155,7 @@ def test_a_scale_error_that_no_log_has_is_not_to_be_used(solution, value, std, s
     (np.sin(np.deg2rad(20)) / np.sin(np.deg2rad(30)) - 1, "look 20 deg from the vertical, and 30"),
     (np.sin(np.deg2rad(25)) / np.sin(np.deg2rad(30)) - 1, "look 25 deg from the vertical, and 30"),
     (-2.02, "the sign is reversed"),
-    (-1.2, "a current, a unit or another error"),
+    (-1.2, "a current, a wrong unit or another error"),
 ])  # fmt: skip
 def test_a_scale_error_names_its_cause(solution, value, cause):
     scale = replace(

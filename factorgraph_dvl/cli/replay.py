@@ -156,7 +156,7 @@ def _run(
     """Run the replay; if live, show what is known and whether it is good enough as it goes."""
     from factorgraph_dvl.replay import KINDS, Update
     from factorgraph_dvl.replay import replay as run
-    from factorgraph_dvl.replay.verdict_as_it_goes import VerdictAsItGoes
+    from factorgraph_dvl.replay.playback import VerdictAsItGoes
 
     kind = next(k for k in KINDS if k == smoother)
     began = perf_counter()

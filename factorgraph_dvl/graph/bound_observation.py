@@ -17,8 +17,8 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, time_on_chain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.processes import Process
-from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows

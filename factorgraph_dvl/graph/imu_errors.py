@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import gtsam
@@ -18,6 +19,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.preintegration import Segments
+from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
     at_errors,
@@ -28,7 +30,7 @@ from factorgraph_dvl.imu.sensitivity import (
     predicted,
     sensitivities,
 )
-from factorgraph_dvl.imu.two_way import TwoWay, TwoWayTransition, shares
+from factorgraph_dvl.imu.two_way import shares
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization
 
@@ -83,21 +85,28 @@ class ImuErrors:
         self._elements = elements(parameters)
         self._of_ends: Sensitivity | None = None
         # For as long as something hangs there.
-        self._by: WeakKeyDictionary[TwoWay, Sensitivity] = WeakKeyDictionary()
+        self._by: WeakKeyDictionary[Any, Sensitivity] = WeakKeyDictionary()
         self._factors: list[gtsam.JacobianFactor] = []
 
     def vector(self, parameters: Mapping[str, Array]) -> Array:
         """Return the errors among parameters, (n,), SI."""
         return np.concatenate([parameters[name] for name in self.names])
 
-    def attach(self, attachments: Sequence[TwoWay]) -> None:
+    def ends(self, parameters: Mapping[str, Array]) -> Array:
+        """Return by how much the predicted states at the ends of segments move, (S, 9)."""
+        return np.asarray(self._ends @ self.vector(parameters))
+
+    def attach(self, attachments: Sequence[Any]) -> None:
         """Find how what is integrated up to attached times moves, of all of them at once."""
         new = [at for at in {id(at): at for at in attachments}.values() if at not in self._by]
         if new or self._of_ends is None:
-            self._of_ends, found = sensitivities(
-                self._segments, self._elements, [at.forward for at in new]
-            )
+            forward = [self.forward(at) for at in new]
+            self._of_ends, found = sensitivities(self._segments, self._elements, forward)
             self._by.update(zip(new, found, strict=True))
+
+    def forward(self, at: Any) -> Attachment:
+        """Return where times hang on the nodes before."""
+        return at.forward
 
     @cached_property
     def _ends(self) -> Array:
@@ -107,32 +116,32 @@ class ImuErrors:
         assert self._of_ends is not None
         return predicted(self._segments, self._of_ends)
 
-    def sensitivity(self, at: TwoWay) -> Sensitivity:
+    def sensitivity(self, at: Any) -> Sensitivity:
         """Return how what is integrated from the nodes before moves with the errors."""
         self.attach([at])
         return self._by[at]
 
-    def without(self, at: TwoWay, by: Sensitivity, errors: Array) -> TwoWay:
+    def without(self, at: Any, by: Sensitivity, errors: Array) -> Any:
         """Return an attachment without the errors (n,), which move it by its sensitivity."""
         assert self._of_ends is not None
         return corrected_two_way(at, by, self._of_ends, self._segments, self._elements, errors)
 
     def columns(
-        self,
-        lin: Linearization,
-        transition: TwoWayTransition,
-        by: Sensitivity,
-        errors: Array,
+        self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array
     ) -> dict[str, Array]:
         """Return derivatives of measurements by the errors (n,) there, (M, d, n_i) by name."""
+        every = self._every(lin, transition, by, errors)
+        parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
+        return dict(zip(self.names, parts, strict=True))
+
+    def _every(self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array) -> Array:
+        """Return derivatives of measurements by all errors (n,), (M, d, n)."""
         assert self._of_ends is not None
         by, ends = (at_errors(each, errors) for each in (by, self._of_ends))
         back = carried_back_by(transition.at, by, ends)
         ahead, behind = shares(lin, transition)
         every = by_errors(ahead, transition.forward, by, self._elements)
-        every += by_errors(behind, transition.backward, back, self._elements)
-        parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
-        return dict(zip(self.names, parts, strict=True))
+        return every + by_errors(behind, transition.backward, back, self._elements)
 
     def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
         """Return native factors with what errors (n,) change in those of the IMU.

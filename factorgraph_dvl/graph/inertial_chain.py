@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import gtsam
 import numpy as np
@@ -152,7 +152,7 @@ class InertialChain:
         Up to what no factor on the noise of gyros or accelerometers changes.
         """
         imu = self.imu
-        noise = np.log([imu.gyro_noise_deg_sqrt_h, imu.accel_noise_ug_sqrt_hz])
+        noise = np.log([imu.gyro_noise_root_psd, imu.accel_noise_root_psd])
         walks = float(np.log(self.bias_steps).sum()) if self.walking else 0.0
         return 2.0 * (self.count * float(noise @ [3.0, 6.0]) + walks)
 
@@ -204,7 +204,7 @@ class InertialChain:
         """Return the states that measurements after node k depend on: its own, and the next."""
         return self._states(values, range(k, k + 2))
 
-    def from_node(self, k: int) -> InertialChain:
+    def from_node(self, k: int) -> Self:
         """Return what carries the motion from node k to the next, which then are the first two."""
         seg = self.segments
         i = int(np.searchsorted(seg.origin, k))
@@ -424,6 +424,13 @@ class InertialChain:
         vars(out)["zeros"] = self.zeros
         return out
 
+    def following(self, seg: Segments, gravity_n: Array, first: int) -> Self:
+        """Return the chain of other segments, such as the next one: its nodes begin at `first`."""
+        graph = gtsam.NonlinearFactorGraph()
+        out = replace(self, segments=seg, gravity_n=gravity_n, graph=graph)
+        _add_motion(out, first)
+        return out
+
     def nodes_of(self, block: slice) -> range:
         """Return the nodes from the first of some segments to that of the segments after them."""
         origin, count = self.segments.origin, self.segments.node_time.size
@@ -449,11 +456,23 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
     graph = gtsam.NonlinearFactorGraph()
     first, mean = (trial.inertial.parameters(t) for t in (0.0, float(seg.duration.sum())))
     chain = InertialChain(frame, seg, gravity_n, mean, first, settings, graph)
-    pims = gtsam_measurements(seg, settings, gravity_n, frame.earth_rate)
-    for k, pim in zip(seg.origin.tolist(), pims, strict=True):
+    _add_motion(chain)
+    for a, (begin, _) in enumerate(seg.arc_nodes):
+        state, root = _state_prior(trial, frame, seg, start, int(begin), is_first=a == 0)
+        graph.add(gtsam.PriorFactorNavState(keys.node(int(begin)), state, square_root(root)))
+    for (_, last), (begin, _) in pairwise(seg.arc_nodes):
+        graph.add(_gap_factor(int(last), int(begin), seg.node_time))
+    return chain
+
+
+def _add_motion(chain: InertialChain, first: int = 0) -> None:
+    """Add the IMU factors and the walks of the biases; `first` is the index of the first node."""
+    seg, graph = chain.segments, chain.graph
+    pims = gtsam_measurements(seg, chain.imu, chain.gravity_n, chain.frame.earth_rate)
+    for k, pim in zip((first + seg.origin).tolist(), pims, strict=True):
         graph.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), chain.bias_key(k), pim))
     if chain.walking:
-        for k, walk in enumerate(chain.bias_steps):
+        for k, walk in enumerate(chain.bias_steps, start=first):
             graph.add(
                 gtsam.BetweenFactorConstantBias(
                     keys.bias(k),
@@ -462,12 +481,6 @@ def inertial_chain(trial: Trial, frame: LocalFrame, seg: Segments, start: States
                     loose_diagonal(walk),
                 )
             )
-    for a, (begin, _) in enumerate(seg.arc_nodes):
-        state, root = _state_prior(trial, frame, seg, start, int(begin), is_first=a == 0)
-        graph.add(gtsam.PriorFactorNavState(keys.node(int(begin)), state, square_root(root)))
-    for (_, last), (begin, _) in pairwise(seg.arc_nodes):
-        graph.add(_gap_factor(int(last), int(begin), seg.node_time))
-    return chain
 
 
 def _state_prior(

@@ -75,7 +75,7 @@ def native_graph(problem: WholeProblem) -> gtsam.NonlinearFactorGraph:
 _Linearize = Callable[[gtsam.Values], tuple[Array, Array]]
 
 
-def _factor(
+def custom_factor(
     every: Sequence[int], sizes: Sequence[int], rows: int, linearize: _Linearize
 ) -> gtsam.CustomFactor:
     """Return a custom factor of unit noise; shapes are checked, as GTSAM crashes by wrong ones."""
@@ -116,7 +116,7 @@ def _measurement_factor(
         )
         return residual[0], matrix[0]
 
-    return _factor(every, bound.sizes(processes, parameters), rows, linearize)
+    return custom_factor(every, bound.sizes(processes, parameters), rows, linearize)
 
 
 def _step_factors(problem: WholeProblem) -> Iterator[gtsam.CustomFactor]:
@@ -134,7 +134,7 @@ def _step_factor(chain: Chain, k: int, every: Sequence[int]) -> gtsam.CustomFact
         (step,) = local.steps(chain.states_around(at, k))
         return step.residual[0], step.by_nodes[0]
 
-    return _factor(every, chain.sizes, sum(chain.sizes) // 2, linearize)
+    return custom_factor(every, chain.sizes, sum(chain.sizes) // 2, linearize)
 
 
 def _parameters_at(

@@ -6,156 +6,34 @@ one for a measurement.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import accumulate
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.graph.clocks import linearized, parameters_of, true_time
+from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes
+from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.clocks import time_on_chain
+from factorgraph_dvl.graph.forward_chain import ForwardChain
+from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.priors import places, prior_mean, value_at
+from factorgraph_dvl.graph.native_graph import custom_factor
+from factorgraph_dvl.graph.observation_rows import ObservationRows
+from factorgraph_dvl.graph.priors import prior_mean, value_at
 from factorgraph_dvl.imu.preintegration import Preintegration
-from factorgraph_dvl.imu.propagation import (
-    Attachment,
-    States,
-    Transition,
-    attach_inside,
-    extrapolated,
-    motion_at,
-    with_bias,
-)
-from factorgraph_dvl.imu.sensitivity import Sensitivity, by_errors, corrected, elements
-from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.imu.propagation import Attachment, States
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import (
-    ExpectedCorrelation,
-    Linearization,
-    Motion,
-    Observation,
-    ScaleWalk,
-    SensorClock,
-)
+from factorgraph_dvl.sensors.protocol import Motion, Observation
 
 # What rounding may take off a time, s.
 _ROUNDING = 1e-6
-
-
-@dataclass(frozen=True)
-class ObservationRows:
-    """Some measurements of an observation, as an observation.
-
-    Parameters
-    ----------
-    whole : Observation
-        M measurements.
-    index : ndarray of int, shape (K,)
-        Which of them.
-    """
-
-    whole: Observation
-    index: IntArray
-
-    @property
-    def label(self) -> str:
-        """Name of the measurement, for people."""
-        return self.whole.label
-
-    @property
-    def unit(self) -> str:
-        """Unit of the residual."""
-        return self.whole.unit
-
-    @property
-    def components(self) -> tuple[str, ...]:
-        """Names of the d components."""
-        return self.whole.components
-
-    @property
-    def time(self) -> Array:
-        """Times as in the record, (K,), s."""
-        return self.whole.time[self.index]
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the calibration parameters that it depends on."""
-        return self.whole.parameters
-
-    @property
-    def gate(self) -> float | None:
-        """Standard deviations from which on a measurement is an echo."""
-        return self.whole.gate
-
-    @property
-    def noise_groups(self) -> tuple[tuple[int, ...], ...]:
-        """Components that share a factor on their stated standard deviation."""
-        return self.whole.noise_groups
-
-    @property
-    def correlated(self) -> ExpectedCorrelation | None:
-        """What is known beforehand of noise that persists."""
-        return self.whole.correlated
-
-    @property
-    def scale_walk(self) -> ScaleWalk | None:
-        """How its scale walks."""
-        return self.whole.scale_walk
-
-    @property
-    def independent(self) -> bool:
-        """Whether components are measured apart."""
-        return self.whole.independent
-
-    @property
-    def clock(self) -> SensorClock | None:
-        """Clock of the sensor."""
-        return self.whole.clock
-
-    def sigma(
-        self, motion: Motion, values: Mapping[str, Array], factor: Array | float = 1.0
-    ) -> Array:
-        """Return the standard deviations, (K, d)."""
-        whole = self.whole.sigma(self._embedded(motion), values, factor)
-        return np.asarray(whole[self.index])
-
-    def residual(self, motion: Motion, values: Mapping[str, Array]) -> Array:
-        """Return predicted - measured, (K, d)."""
-        return self.whole.residual(self._embedded(motion), values)[self.index]
-
-    def linearize(
-        self, motion: Motion, values: Mapping[str, Array], wanted: Collection[str]
-    ) -> Linearization:
-        """Return the residual and its Jacobians."""
-        return self.whole.linearize(self._embedded(motion), values, wanted).some(self.index)
-
-    def _embedded(self, motion: Motion) -> Motion:
-        """Return a motion at all M times: what the others see does not matter."""
-        source = np.zeros(self.whole.time.size, dtype=int)
-        source[self.index] = np.arange(self.index.size)
-        return rows_of(motion, source)
-
-
-@dataclass(frozen=True)
-class AttachedMeasurements:
-    """Measurements of one kind, tied to a node.
-
-    Parameters
-    ----------
-    observation : Observation
-        M measurements.
-    at : slice
-        Slice of the node's attachment.
-    time : ndarray, shape (M,)
-        Times for which they were attached, s.
-    """
-
-    observation: Observation
-    at: slice
-    time: Array
+# Their errors are added by those who have them.
+_NO_PROCESSES = Processes(None, ())
 
 
 @dataclass(frozen=True)
@@ -164,78 +42,63 @@ class NodeMeasurements:
 
     Parameters
     ----------
-    attachment : Attachment
-        Of all measurement times, to a node that counts as the first.
-    rows : tuple of AttachedMeasurements
-        The measurements.
+    bound : tuple of BoundObservation
+        The measurements, tied to a chain of which the node is the first.
     parameters : tuple of Parameter
         Those that are estimated and that the measurements depend on.
     fixed : mapping of str to ndarray
         Values of those that are not.
-    gravity_n : ndarray, shape (1, 3)
-        `LocalFrame.gravity_without_rotation`, m/s².
-    earth_rate_n : ndarray, shape (3,), rad/s
-        Earth rate in n.
-    clock_zero : float, optional
-        When the offsets of clocks hold, s.
-    sensitivity : Sensitivity, optional
-        Of the attachment to the errors of the IMU among the parameters.
     """
 
-    attachment: Attachment
-    rows: tuple[AttachedMeasurements, ...]
+    bound: tuple[BoundObservation, ...]
     parameters: tuple[Parameter, ...]
     fixed: Mapping[str, Array]
-    gravity_n: Array
-    earth_rate_n: Array
-    clock_zero: float = 0.0
-    sensitivity: Sensitivity | None = None
+    # What hangs at the times of the last evaluation.
+    _attached: dict[tuple[bytes, ...], list[Attachment]] = field(default_factory=dict)
 
-    def corrected(self, values: Mapping[str, Array]) -> Attachment:
-        """Return the attachment without the errors of the IMU."""
-        if self.sensitivity is None:
-            return self.attachment
-        sizes = np.concatenate([values[p.name] for p in self._imu_errors])
-        return corrected(self.attachment, self.sensitivity, elements(self._imu_errors), sizes)
+    @classmethod
+    def of(
+        cls,
+        bound: Sequence[BoundObservation],
+        estimated: Sequence[Parameter],
+        fixed: Mapping[str, Array],
+    ) -> NodeMeasurements:
+        """Return measurements with those of all estimated parameters that they depend on."""
+        used = {name for b in bound for name in b.names}
+        return cls(tuple(bound), tuple(p for p in estimated if p.name in used), fixed)
 
-    def attachment_of(self, rows: AttachedMeasurements) -> Attachment:
-        """Return the attachment of measurements of one kind."""
-        return rows_of(self.attachment, rows.at)
+    def attach(self, values: Mapping[str, Array]) -> list[Attachment]:
+        """Attach measurements by clocks as they are; those of one time share what they hang on.
 
-    @cached_property
-    def _imu_errors(self) -> list[Parameter]:
-        """The errors of the IMU among the parameters."""
-        return [p for p in self.parameters if p.name in ERRORS]
+        Few times take as long as a single one: all at once.
+        """
+        times = [b.times(values) for b in self.bound]
+        when = tuple(time.tobytes() for time in times)
+        if when not in self._attached:
+            chain, count = self.bound[0].chain, 0
+            whole = chain.attach(np.concatenate(times))
+            found: dict[bytes, Attachment] = {}
+            for time in times:
+                found.setdefault(time.tobytes(), rows_of(whole, slice(count, count + time.size)))
+                count += time.size
+            self._attached.clear()
+            self._attached[when] = [found[each] for each in when]
+        out = self._attached[when]
+        if self.bound[0].errors is not None:
+            self.bound[0].errors.attach(out)
+        for b, at in zip(self.bound, out, strict=True):
+            b.attachment = at
+        return out
 
-    @cached_property
-    def _place(self) -> dict[str, slice]:
-        """Place of each parameter among the components of all."""
-        return places(self.parameters)
-
-    @cached_property
-    def wanted(self) -> list[list[str]]:
-        """Names of the parameters that each kind depends on."""
-        used = [parameters_of(r.observation) for r in self.rows]
-        return [[name for name in self._place if name in each] for each in used]
-
-    def motions(self, states: States, values: Mapping[str, Array]) -> tuple[Motion, list[Motion]]:
-        """Return the motion at all times as attached, and at the true times of each kind."""
-        motion = motion_at(self.corrected(values), states, self.gravity_n, self.earth_rate_n)
-        return motion, self._at_true_times(motion, values)
-
-    def _at_true_times(self, motion: Motion, values: Mapping[str, Array]) -> list[Motion]:
-        out: list[Motion] = []
-        part, at = motion, slice(0, self.attachment.tau.size)
-        for r in self.rows:
-            if r.at != at:
-                part, at = rows_of(motion, r.at), r.at
-            clock = r.observation.clock
-            # A clock that is not estimated stays as it was when the times were attached.
-            if clock is not None and not self._place.keys().isdisjoint(clock.names):
-                late = true_time(r.observation, values, self.clock_zero) - r.time
-                out.append(extrapolated(part, late))
-            else:
-                out.append(part)
+    def motions(self, states: States, values: Mapping[str, Array]) -> list[Motion]:
+        """Return the motion at the true times of each kind; those of one time share it."""
+        values = {**self.fixed, **values}
+        computed: dict[Attachment, Motion] = {}
+        out = []
+        for b, at in zip(self.bound, self.attach(values), strict=True):
+            if at not in computed:
+                computed[at] = b.motion(at, states, values)
+            out.append(computed[at])
         return out
 
     def linearize(
@@ -243,46 +106,25 @@ class NodeMeasurements:
     ) -> tuple[Array, Array, list[Motion]]:
         """Return residuals (R,), their Jacobian (R, 15 + n), and the motions.
 
-        Columns: attitude, position, velocity of the node in GTSAM's tangent space,
-        accelerometer and gyro bias, then the parameters.
+        Columns: variables of the chain, as it has them, then the parameters.
         """
         values = {**self.fixed, **values}
-        at, rate = self.corrected(values), self.earth_rate_n
-        increments = with_bias(at, states)
-        motion = motion_at(at, states, self.gravity_n, rate, increments)
-        motions = self._at_true_times(motion, values)
-        transition = Transition(at, states, motion, rate, increments)
-        first, size = STATE_SIZE + BIAS_SIZE, sum(p.mean.size for p in self.parameters)
+        motions = self.motions(states, values)
+        transitions: dict[Hashable, Any] = {}
+        every = tuple((p.name, p.mean.size) for p in self.parameters)
         residuals, matrices = [], []
-        for r, own, wanted in zip(self.rows, motions, self.wanted, strict=True):
-            lin = linearized(r.observation, own, values, wanted, self.clock_zero)
-            matrix = np.zeros((*lin.residual.shape, first + size))
-            matrix[:, :, :first] = lin.by_motion @ transition.whole[r.at]
-            by_parameters = matrix[:, :, first:]
-            for name, jacobian in lin.d_parameters.items():
-                if name in self._place:
-                    by_parameters[:, :, self._place[name]] = jacobian
-            if self.sensitivity is not None:
-                part = Transition(rows_of(at, r.at), states, rows_of(motion, r.at), rate)
-                of_errors = by_errors(
-                    lin, part, rows_of(self.sensitivity, r.at), elements(self._imu_errors)
-                )
-                columns = np.concatenate([np.r_[self._place[p.name]] for p in self._imu_errors])
-                by_parameters[:, :, columns] = of_errors
-            residuals.append(lin.residual.ravel())
-            matrices.append(matrix.reshape(-1, first + size))
+        for b, motion in zip(self.bound, motions, strict=True):
+            wanted = [p.name for p in b.parameters(self.parameters)]
+            lin = b.linearized(motion, values, wanted, _NO_PROCESSES)
+            own, residual = b.jacobian(
+                lin, slice(None), motion, states, values, wanted, _NO_PROCESSES, transitions
+            )
+            size, columns = _columns(sum(b.chain.sizes), every, tuple(wanted))
+            matrix = np.zeros((residual.size, size))
+            matrix[:, columns] = own.reshape(residual.size, -1)
+            residuals.append(residual.ravel())
+            matrices.append(matrix)
         return np.concatenate(residuals), np.concatenate(matrices), motions
-
-    def residuals(self, states: States, values: Mapping[str, Array]) -> Array:
-        """Return the residuals, (R,)."""
-        values = {**self.fixed, **values}
-        _, motions = self.motions(states, values)
-        return np.concatenate(
-            [
-                r.observation.residual(motion, values).ravel()
-                for r, motion in zip(self.rows, motions, strict=True)
-            ]
-        )
 
     def sigma(
         self,
@@ -296,10 +138,63 @@ class NodeMeasurements:
         """
         values = {**self.fixed, **values}
         each = (
-            r.observation.sigma(motion, values, factors.get(r.observation.label, 1.0))
-            for r, motion in zip(self.rows, motions, strict=True)
+            b.observation.sigma(motion, values, factors.get(b.observation.label, 1.0))
+            for b, motion in zip(self.bound, motions, strict=True)
         )
         return np.concatenate([sigma.ravel() for sigma in each])
+
+
+@lru_cache
+def _columns(
+    first: int, every: tuple[tuple[str, int], ...], wanted: tuple[str, ...]
+) -> tuple[int, IntArray]:
+    """Return the number of columns, and those of the chain and of some parameters."""
+    ends = np.cumsum([first, *(size for _, size in every)]).tolist()
+    own = [np.arange(first)]
+    own += [
+        np.arange(a, b)
+        for (name, _), a, b in zip(every, ends[:-1], ends[1:], strict=True)
+        if name in wanted
+    ]
+    return ends[-1], np.concatenate(own)
+
+
+def bind(
+    chain: Chain,
+    observations: Sequence[Observation],
+    parameters: Sequence[Parameter],
+    key_of: Mapping[str, int],
+    clock_zero: float,
+) -> tuple[list[BoundObservation], ImuErrors | None]:
+    """Tie what was measured in a chain to it.
+
+    Parameters
+    ----------
+    chain : Chain
+        That covers the measurements.
+    observations : sequence of Observation
+        What was measured.
+    parameters : sequence of Parameter
+        Those that are estimated.
+    key_of : mapping of str to int
+        Their keys.
+    clock_zero : float
+        When the offsets of clocks hold, s.
+
+    Returns
+    -------
+    bound : list of BoundObservation
+        The measurements, with a weight of one.
+    errors : ImuErrors or None
+        Errors of the IMU among the parameters.
+    """
+    errors = chain.errors(parameters, key_of)
+    bound = []
+    for o in observations:
+        count = o.time.size
+        usable, weight = np.ones(count, dtype=bool), np.ones((count, len(o.components)))
+        bound.append(BoundObservation(o, chain, None, usable, weight, clock_zero, errors))
+    return bound, errors
 
 
 @dataclass(frozen=True)
@@ -346,9 +241,6 @@ def measurement_factor(
 ) -> gtsam.CustomFactor:
     """Return the factor of what was measured after a node; zero error where it is predicted.
 
-    The one adapter between the sensors' equations and GTSAM: GTSAM crashes if a callback
-    leaves a Jacobian unfilled or of another shape, so shapes are checked here.
-
     Parameters
     ----------
     measured : NodeMeasurements
@@ -363,39 +255,29 @@ def measurement_factor(
         Derivatives (R, n) of the residuals by vectors that add to them, by their keys.
     """
     kept = [first] if first is not None else []
-    every = [node_key, bias_key, *parameter_keys]
     added = [] if errors is None else [*errors.items()]
+    every = [node_key, bias_key, *parameter_keys, *(key for key, _ in added)]
     sizes = [STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in measured.parameters)]
-    edges = list(accumulate(sizes, initial=0))
-    rows = weight.size
+    sizes += [gain.shape[1] for _, gain in added]
     if len(every) != len(sizes):
         raise ValueError(f"{len(parameter_keys)} keys for {len(measured.parameters)} parameters")
 
-    def error(this: gtsam.CustomFactor, at: gtsam.Values, jacobians: list[Array] | None) -> Array:
+    def linearize(at: gtsam.Values) -> tuple[Array, Array]:
         state, bias = at.atNavState(node_key), at.atConstantBias(bias_key)
         values = {
-            p.name: at.atRot3(key).matrix() if p.rotation else at.atVector(key)
+            p.name: value_at(at, key, p)
             for p, key in zip(measured.parameters, parameter_keys, strict=True)
         }
-        error = sum((gain @ at.atVector(key) for key, gain in added), start=np.zeros(rows))
-        if jacobians is None:
-            return weight * (measured.residuals(state_of(state, bias), values) + error)
         once = kept.pop() if kept else None
         if once is not None and once.is_at(state, bias, values):
             residual, matrix = once.residual, once.jacobian
         else:
             residual, matrix, _ = measured.linearize(state_of(state, bias), values)
-        if matrix.shape != (rows, edges[-1]) or len(jacobians) != len(sizes) + len(added):
-            raise ValueError(f"Jacobian of shape {matrix.shape}, expected {(rows, edges[-1])}")
-        matrix = matrix * weight[:, None]
-        for i in range(len(sizes)):
-            jacobians[i] = np.asfortranarray(matrix[:, edges[i] : edges[i + 1]])
-        for i, (_, gain) in enumerate(added, start=len(sizes)):
-            jacobians[i] = np.asfortranarray(weight[:, None] * gain)
-        return weight * (residual + error)
+        for key, gain in added:
+            residual, matrix = residual + gain @ at.atVector(key), np.hstack([matrix, gain])
+        return weight * residual, weight[:, None] * matrix
 
-    every += [key for key, _ in added]
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), every, error)
+    return custom_factor(every, sizes, weight.size, linearize)
 
 
 def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
@@ -482,25 +364,26 @@ def sensor_factor(
     fixed = {p.name: prior_mean(p) for p in parameters}
     free = tuple(p for p in parameters if p.name in keys)
     given = {**fixed, **{p.name: value_at(values, keys[p.name], p) for p in free}}
-    node, attachment = attached_rows(observation, chain, given, clock_zero)
+    node = nodes_before(observation, chain, given, clock_zero)
     (index,) = np.nonzero(node == k)
     if not index.size:
         raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
-    own = ObservationRows(observation, index)
-    measured = NodeMeasurements(
-        attachment=at_first_node(rows_of(attachment, index)),
-        rows=(AttachedMeasurements(own, slice(0, index.size), true_time(own, given, clock_zero)),),
-        parameters=free,
-        fixed=fixed,
-        gravity_n=chain.gravity_n[k : k + 1],
-        earth_rate_n=chain.frame.earth_rate,
-        clock_zero=clock_zero,
-    )
+    some = ObservationRows(observation, index)
+    bound, _ = bind(_inertial(chain).from_node(k), [some], (), {}, clock_zero)
+    measured = NodeMeasurements(tuple(bound), free, fixed)
     states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
-    _, motions = measured.motions(states, given)
-    weight = 1.0 / measured.sigma(motions, given, {})
+    weight = 1.0 / measured.sigma(measured.motions(states, given), given, {})
     shared = [keys[p.name] for p in free]
     return measurement_factor(measured, weight, keys["state"], keys["bias"], shared)
+
+
+def _inertial(chain: Preintegration) -> ForwardChain:
+    """Return the chain of a preintegration, without its factors."""
+    biases = chain.imu.parameters(0.0)
+    graph = gtsam.NonlinearFactorGraph()
+    return ForwardChain(
+        chain.frame, chain.segments, chain.gravity_n, biases, biases, chain.imu.settings, graph
+    )
 
 
 def measured_nodes(
@@ -535,21 +418,14 @@ def measured_nodes(
     [0, 1, 2, 3]
     """
     fixed = {p.name: prior_mean(p) for p in parameters}
-    node, _ = attached_rows(observation, chain, fixed, clock_zero)
+    node = nodes_before(observation, chain, fixed, clock_zero)
     return [int(k) for k in np.unique(node) if k >= 0]
 
 
-def attached_rows(
+def nodes_before(
     observation: Observation, chain: Preintegration, values: Mapping[str, Array], clock_zero: float
-) -> tuple[IntArray, Attachment]:
-    """Return the nodes before measurements (M,), -1 outside the chain, and their attachment."""
-    time = true_time(observation, values, clock_zero)
-    attachment, _ = attach_inside(chain.segments, time, chain.frame.earth_rate)
+) -> IntArray:
+    """Return the nodes before measurements (M,), -1 outside the chain."""
+    time = time_on_chain(observation, values, clock_zero, None)
     inside = (time > chain.time[0] - _ROUNDING) & (time < chain.time[-1] + _ROUNDING)
-    return np.where(inside, attachment.node, -1), attachment
-
-
-def at_first_node(attachment: Attachment) -> Attachment:
-    """Return the attachment of measurements after one node as if it were the first."""
-    first = np.zeros(attachment.node.size, dtype=int)
-    return replace(attachment, node=first, segment=first)
+    return np.where(inside, _inertial(chain).attach(time).node, -1)

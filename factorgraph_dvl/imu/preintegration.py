@@ -379,12 +379,15 @@ class Preintegration:
     measurements : list of gtsam.PreintegratedImuMeasurementsG
         One for each segment, for a `gtsam.GalileanImuFactor2` between two `NavState` and a
         `ConstantBias`.
+    imu : Imu
+        The IMU, of which the settings count.
     """
 
     frame: LocalFrame
     segments: Segments
     gravity_n: Array
     measurements: list[gtsam.PreintegratedImuMeasurementsG]
+    imu: Imu
 
     @property
     def time(self) -> Array:
@@ -462,9 +465,8 @@ def preintegrate(
     seg = _integrated(inc, [cuts])
     places = np.zeros((cuts.size, 3)) if p_n is None else np.asarray(p_n, dtype=float)
     gravity_n = frame.gravity_without_rotation(0.5 * (places[:-1] + places[1:]))
-    return Preintegration(
-        frame, seg, gravity_n, gtsam_measurements(seg, imu.settings, gravity_n, frame.earth_rate)
-    )
+    measurements = gtsam_measurements(seg, imu.settings, gravity_n, frame.earth_rate)
+    return Preintegration(frame, seg, gravity_n, measurements, imu)
 
 
 def one_segment(inc: Increments, first: int, last: int) -> Segments:

@@ -41,7 +41,7 @@ class States:
     accel_bias: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Attachment:
     """Where M measurement times hang on the chain, and the increments up to them.
 
@@ -238,82 +238,15 @@ class Transition:
         return self.at.tau[:, None, None]
 
     @cached_property
-    def theta_theta(self) -> Array:
-        """Attitude by attitude, (M, 3, 3)."""
-        return self.moved[0].transpose(0, 2, 1)
-
-    @cached_property
-    def theta_gyro(self) -> Array:
-        """Attitude by gyro bias."""
-        return -self.theta_theta @ self.at.dA
-
-    @cached_property
     def omega_theta(self) -> Array:
         """Rate relative to the Earth by attitude at the time; by gyro bias it is -I."""
         return -skew(rotate(self.motion.nRb.transpose(0, 2, 1), self.earth_rate_n))
-
-    @cached_property
-    def p_theta(self) -> Array:
-        """Position by attitude."""
-        return -self.turned @ skew(self.moved[2])
 
     @cached_property
     def p_p(self) -> Array:
         """Position by position."""
         R = self.states.nRb[self.at.node]
         return self.turned + self._tau * (self.at.turn @ (self._cross_rate @ R))
-
-    @cached_property
-    def p_v(self) -> Array:
-        """Position by velocity."""
-        return self._tau * self.turned
-
-    @cached_property
-    def p_gyro(self) -> Array:
-        """Position by gyro bias."""
-        return self.v_gyro * (self._tau / 3.0)
-
-    @cached_property
-    def p_accel(self) -> Array:
-        """Position by accelerometer bias."""
-        return self.v_accel * (self._tau / 2.0)
-
-    @cached_property
-    def v_theta(self) -> Array:
-        """Velocity by attitude."""
-        return -self.turned @ skew(self.moved[1]) - self._cross_rate @ self.p_theta
-
-    @cached_property
-    def v_v(self) -> Array:
-        """Velocity by velocity."""
-        return self.turned - self._cross_rate @ self.p_v
-
-    @cached_property
-    def v_gyro(self) -> Array:
-        """Velocity by gyro bias, for force and rate constant since the node."""
-        return self.turned @ (0.5 * skew(self.at.dV) @ self.at.dA)
-
-    @cached_property
-    def v_accel(self) -> Array:
-        """Velocity by accelerometer bias."""
-        return -self.turned @ self.at.dA
-
-    @cached_property
-    def whole(self) -> Array:
-        """Attitude, position, velocity and rate by the node before, (M, 12, 15).
-
-        Columns: attitude, position, velocity, accelerometer bias, gyro bias.
-        """
-        out = np.zeros((self.at.tau.size, 12, 15))
-        out[:, 0:3, 0:3], out[:, 0:3, 12:15] = self.theta_theta, self.theta_gyro
-        out[:, 3:6, 0:3], out[:, 3:6, 3:6] = self.p_theta, self.p_p
-        out[:, 3:6, 6:9], out[:, 6:9, 6:9] = self.p_v, self.v_v
-        out[:, 3:6, 9:12], out[:, 3:6, 12:15] = self.p_accel, self.p_gyro
-        out[:, 6:9, 0:3] = self.v_theta
-        out[:, 6:9, 9:12], out[:, 6:9, 12:15] = self.v_accel, self.v_gyro
-        out[:, 9:12] = self.omega_theta @ out[:, 0:3]
-        out[:, 9:12, 12:15] -= IDENTITY
-        return out
 
 
 def attitude_jacobian(lin: Linearization, transition: Transition) -> Array | None:

@@ -42,7 +42,7 @@ class TwoWay:
     share, share_rate : ndarray, shape (M,)
         Share s of the motion carried back, and its time derivative, 1/s.
     bend : ndarray, shape (M,), s
-        s (1 - s) / 2 over the derivative of s, which both vanish at nodes.
+        Ratio of s (1 - s) / 2 and the derivative of s, which both vanish at nodes.
     beyond : ndarray, shape (M,), s
         How much later than there each time is, where the chain does not cover it.
     """

@@ -145,7 +145,6 @@ class Code(StrEnum):
     MEAN_OR_LAST = "mean_or_last", "note"
     # What a replay noticed.
     ERROR_LEFT_OUT = "error_left_out"
-    IMU_ERRORS_LEFT_OUT = "imu_errors_left_out"
     SILENT = "silent", "note"
     HEARD_AGAIN = "heard_again", "note"
     CONTRADICTS = "contradicts"

@@ -175,11 +175,10 @@ class CorrelatedErrors:
         duration : float, s
             Time between the states.
         """
-        after = np.clip(measured.attachment.tau / duration, 0.0, 1.0)
         rows, shares = [], []
-        for r in measured.rows:
-            o = r.observation
-            own = np.zeros((r.time.size, len(o.components), self.size))
+        for b in measured.bound:
+            o = b.observation
+            own = np.zeros((*b.weight.shape, self.size))
             place = self.places.get(o.label)
             if place is not None:
                 own[:, :, place] = np.diag(self.sigma[place])
@@ -187,6 +186,7 @@ class CorrelatedErrors:
                 _, i = self.walks[o.label]
                 own[:, :, i] = self.sigma[i] * o.scale_walk.measured
             rows.append(own.reshape(-1, self.size))
-            shares.append(after[r.at].repeat(len(o.components)))
+            after = np.clip(b.attachment.tau / duration, 0.0, 1.0)
+            shares.append(after.repeat(len(o.components)))
         whole, share = np.concatenate(rows), np.concatenate(shares)[:, None]
         return (1.0 - share) * whole, share * whole

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,17 +15,14 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.inertial_chain import LEAST_WALK
+from factorgraph_dvl.graph.forward_chain import ForwardChain
+from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
-from factorgraph_dvl.graph.priors import (
-    ConstantsPrior,
-    local_coordinates,
-    loose_diagonal,
-    value_at,
-)
+from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
+    bind,
     measurement_factor,
     state_of,
 )
@@ -36,19 +34,44 @@ from factorgraph_dvl.graph.trajectory import (
     successive,
     trajectory_at,
 )
-from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
+from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
-from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.gravity import LocalGravity
-from factorgraph_dvl.replay.measurements import attached, gated
+from factorgraph_dvl.replay.gate import InnovationGate, gated
+from factorgraph_dvl.replay.record import Innovations
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
-from factorgraph_dvl.replay.update import Innovations
-from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.protocol import Aid, Observation
+
+# Distance, m, over which gravity is taken as linear. Measured against the full model: the error
+# stays below 3e-9 m/s².
+_LINEAR = 100.0
+
+
+class LocalGravity:
+    """`LocalFrame.gravity_without_rotation`, expanded to first order about a recent position.
+
+    Parameters
+    ----------
+    frame : LocalFrame
+        Navigation frame in which positions are given.
+    """
+
+    def __init__(self, frame: LocalFrame) -> None:
+        self._frame = frame
+        self._origin = np.full(3, np.inf)
+
+    def at(self, p_n: Array) -> Array:
+        """Return gravity (1, 3), m/s², at a position (1, 3), m."""
+        shift = p_n[0] - self._origin
+        if shift @ shift > _LINEAR**2:
+            self._origin = p_n[0]
+            nearby = p_n + _LINEAR * np.vstack([np.zeros(3), np.eye(3)])
+            found = self._frame.gravity_without_rotation(nearby)
+            self._value, self._gradient = found[0], (found[1:] - found[0]) / _LINEAR
+        return self._value + (p_n - self._origin) @ self._gradient
 
 
 @dataclass(frozen=True)
@@ -62,11 +85,20 @@ class _LinearizationPoint:
 
 @dataclass(frozen=True)
 class _Segment:
-    """A segment, gravity (1, 3) along it, and the epochs in it."""
+    """A segment as a chain of its own, and the epochs in it."""
 
-    segment: Segments
-    gravity_n: Array
-    epochs: Epochs
+    chain: ForwardChain
+
+    @cached_property
+    def epochs(self) -> Epochs:
+        """The epochs of a trajectory, attached once they are asked for."""
+        start, end = self.chain.node_time.tolist()
+        return self.at(epochs_between(start, end, TRAJECTORY_RATE))
+
+    def at(self, time: Array) -> Epochs:
+        """Return some epochs, attached."""
+        rate = self.chain.frame.earth_rate
+        return attached_epochs(self.chain.segments, time, rate, np.empty(0))[0]
 
 
 class Navigator:
@@ -76,8 +108,6 @@ class Navigator:
     ----------
     start : ReplayStart
         State, covariance and parameters to start from.
-    imu : Imu
-        IMU, of which the settings count.
     gate : InnovationGate
         Gate that decides which measurements are used.
     lag : float or None
@@ -102,14 +132,12 @@ class Navigator:
     def __init__(
         self,
         start: ReplayStart,
-        imu: Imu,
         gate: InnovationGate,
         *,
         lag: float | None,
         memory: float,
     ) -> None:
         self.start = start
-        self._imu = imu
         self._gate = gate
         self._memory = memory
         self.smoother = Smoother(
@@ -123,7 +151,7 @@ class Navigator:
             ranges=start.ranges,
             errors=start.errors.size,
         )
-        self._report = CalibrationReport(start.all_parameters, *imu.parameters(0.0))
+        self._report = CalibrationReport(start.all_parameters, *start.chain.first_biases)
         self._gravity = LocalGravity(start.frame)
         self._segments: dict[int, _Segment] = {}
         # By the names of parameters: their columns, and those of state and bias before them.
@@ -176,30 +204,26 @@ class Navigator:
         states = state_of(state, bias)
         duration = float(seg.duration[0])
         gravity = self._gravity.at(states.p_n + 0.5 * duration * states.v_n)
-
+        chain = self.start.chain.following(seg, gravity, k)
+        self._segments[k] = _Segment(chain)
+        measured, imu_errors = self._bound(chain, aids)
+        motion: Any = chain.graph.at(0)
+        predicted = motion.preintegratedMeasurements().predict(state, bias)
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        pim = gtsam_measurements(seg, self._imu.settings, gravity, self.start.frame.earth_rate)[0]
-        factors.add(gtsam.GalileanImuFactor2(keys.node(k), keys.node(k + 1), s.bias_key(k), pim))
-        predicted = pim.predict(state, bias)
+        if imu_errors is not None:
+            predicted = predicted.retract(imu_errors.ends(self.values)[0])
+            (motion,) = imu_errors.factors(chain.graph)
+        factors.add(motion)
         # By its name GTSAM finds the overload in a third of the time.
         values.insert(keys.node(k + 1), nav_state=predicted)
         if self.start.walking:
-            walk = np.maximum(self._walk_root_psd * np.sqrt(duration), LEAST_WALK)
-            none = gtsam.imuBias.ConstantBias()
-            factors.add(
-                gtsam.BetweenFactorConstantBias(
-                    keys.bias(k), keys.bias(k + 1), none, loose_diagonal(walk)
-                )
-            )
+            factors.add(chain.graph.at(1))
             values.insert(keys.bias(k + 1), bias)
         errors = self.start.errors
         if errors.size:
             factors.add(errors.transition(k, duration))
             values.insert(keys.correlated(k + 1), errors.after(duration) * s.errors(k))
         end = float(seg.node_time[1])
-        time = epochs_between(self.time, end, TRAJECTORY_RATE)
-        measured, epochs = attached(aids, seg, gravity, self.start, self.values, time)
-        self._segments[k] = _Segment(seg, gravity, epochs)
         if measured is not None:
             self._add_factor(factors, k, measured)
         s.extend(end, factors, values)
@@ -220,15 +244,26 @@ class Navigator:
         """Add measurements that arrived late, by the index of the state before them."""
         factors = gtsam.NonlinearFactorGraph()
         for k, records in aids.items():
-            part, none = self._segments[k], np.empty(0)
-            measured, _ = attached(
-                records, part.segment, part.gravity_n, self.start, self.values, none
-            )
+            measured, _ = self._bound(self._segments[k].chain, records)
             if measured is not None:
                 self._add_factor(factors, k, measured)
         if factors.size():
             self.smoother.correct(factors, min(aids))
             self._refresh()
+
+    def _bound(
+        self, chain: ForwardChain, aids: Sequence[Aid]
+    ) -> tuple[NodeMeasurements | None, ImuErrors | None]:
+        """Return what was measured in a segment, None if nothing, and errors of the IMU there."""
+        start = self.start
+        observations: list[Observation] = []
+        for aid in aids:
+            observations += aid.observations(start.frame, start.body_axes)
+        own = self.smoother.calibration_keys
+        bound, errors = bind(chain, observations, start.parameters, own, start.clock_zero)
+        if not bound:
+            return None, errors
+        return NodeMeasurements.of(bound, start.parameters, start.fixed), errors
 
     def known(self, later: float) -> ConstantsPrior:
         """Return what will be known of biases and parameters `later` seconds from now."""
@@ -283,7 +318,7 @@ class Navigator:
         P = self.smoother.state_covariances([*wanted, last])
         states = self.smoother.states([*wanted, last])
         parts = [self._segments[k] for k in wanted]
-        gravity = np.concatenate([part.gravity_n for part in parts])
+        gravity = np.concatenate([part.chain.gravity_n for part in parts])
         epochs = successive([part.epochs for part in parts])
         return trajectory_at(epochs, states, P, gravity, self.start.frame, body_axes)
 
@@ -301,15 +336,14 @@ class Navigator:
             time = epochs_between(since, end, TRAJECTORY_RATE)
             epochs, P = part.epochs, np.stack(covariances)
             if not np.array_equal(time, epochs.time):
-                none = np.empty(0)
-                epochs, _ = attached_epochs(part.segment, time, start.frame.earth_rate, none)
-            return trajectory_at(epochs, states, P, part.gravity_n, start.frame, body_axes)
+                epochs = part.at(time)
+            return trajectory_at(epochs, states, P, part.chain.gravity_n, start.frame, body_axes)
 
         return motion
 
     @property
     def _walk_root_psd(self) -> Array:
-        s = self._imu.settings
+        s = self.start.chain.imu
         return np.repeat([s.accel_bias_walk_root_psd, s.gyro_bias_walk_root_psd], 3)
 
     def _refresh(self) -> None:
@@ -364,7 +398,7 @@ class Navigator:
     ) -> tuple[dict[int, Array], Array]:
         """Return the derivatives of residuals after state k by its errors, and their estimate."""
         s, errors = self.smoother, self.start.errors
-        duration = float(self._segments[k].segment.duration[0])
+        duration = float(self._segments[k].chain.segments.duration[0])
         by_before, by_after = errors.gains(measured, duration)
         before = s.errors(k)
         after = errors.after(duration) * before if k == s.node else s.errors(k + 1)

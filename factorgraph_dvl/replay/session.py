@@ -18,15 +18,19 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.replay.clocks import Clocks
-from factorgraph_dvl.replay.duplicates import Duplicates
+from factorgraph_dvl.replay.arrivals import (
+    AHEAD,
+    SAME_TIME,
+    Clocks,
+    Duplicates,
+    Outages,
+    PendingMeasurements,
+)
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.initializer import Initializer
 from factorgraph_dvl.replay.navigator import Navigator
-from factorgraph_dvl.replay.outages import Outages
-from factorgraph_dvl.replay.pending import AHEAD, SAME_TIME, PendingMeasurements
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
-from factorgraph_dvl.replay.update import Update
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
@@ -39,11 +43,6 @@ KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
 # within 0.1 standard deviations of a batch solution.
 LAG = 30.0
 RATE = 5.0
-_IMU_ERRORS_LEFT_OUT = Finding(
-    Code.IMU_ERRORS_LEFT_OUT,
-    message("imu_errors_left_out.replay"),
-    sensor="IMU",
-)
 
 
 class Replay:
@@ -106,9 +105,6 @@ class Replay:
                 hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
             )
         self._findings: list[Finding] = []
-        if any(p.estimated for p in settings.inertial.error_parameters()):
-            settings = replace(settings, imu=settings.inertial.without_errors())
-            self._findings.append(_IMU_ERRORS_LEFT_OUT)
         self._settings = settings
         self._sections = tuple(aid.section for aid in settings.aids)
         self._kind = smoother
@@ -267,7 +263,8 @@ class Replay:
                 self._restart(nav, seg)
                 continue
             until = float(seg.node_time[1])
-            if end and until > self._samples.newest - 0.5 * self._samples.dt:
+            last = end and until > self._samples.newest - 0.5 * self._samples.dt
+            if last:
                 # No segment follows that what was measured right now would belong to.
                 until += 2.0 * SAME_TIME
             nav.extend(seg, self._take(nav, until))
@@ -277,7 +274,9 @@ class Replay:
             self._samples.forget(nav.time)
             trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
             self._trajectory_to = nav.time
-            again = self._solve_again(nav) if self._initializer.solve_due(nav) else None
+            # What has not settled by the end is solved once more.
+            due = self._initializer.solve_due(nav) or (last and not self.settled)
+            again = self._solve_again(nav) if due else None
             known, solved = (nav, False) if again is None else (again, True)
             yield self._update(known, began, trajectory, solved=solved, end=end)
 
@@ -321,9 +320,7 @@ class Replay:
         self._deferred.clear()
         self._noise = start.noise
         lag = self._lag if self._kind == "fixed-lag" else None
-        self._navigator = Navigator(
-            start, self._settings.inertial, self._gate, lag=lag, memory=self._lag
-        )
+        self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
         self._samples.windows = start.windows
         self._smoothed_to = start.node
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.

@@ -21,13 +21,12 @@ from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.replay.batch_solution import BatchSolution
+from factorgraph_dvl.replay.arrivals import Outages
 from factorgraph_dvl.replay.calibration import CalibrationReport
-from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.outages import Outages
-from factorgraph_dvl.replay.sequential_gate import Judged, judged
-from factorgraph_dvl.replay.update import Update
+from factorgraph_dvl.replay.gate import InnovationGate, Judged, judged
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.window import (
+    BatchSolution,
     Past,
     Window,
     WindowChain,

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.priors import prior_root
 from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
 from factorgraph_dvl.replay.start import ReplayStart
@@ -74,10 +75,9 @@ class SpuriousInformation:
             Time of the state, s.
         """
         changed = False
-        for r, wanted, motion, weight in zip(
-            measured.rows, measured.wanted, motions, weights, strict=True
-        ):
-            o = r.observation
+        for b, motion, weight in zip(measured.bound, motions, weights, strict=True):
+            o = b.observation
+            wanted = [p.name for p in measured.parameters if p.name in parameters_of(o)]
             used = int(np.count_nonzero(weight.any(axis=1)))
             if not wanted or not used:
                 continue
@@ -86,7 +86,7 @@ class SpuriousInformation:
                 continue
             part = spurious_by(
                 o,
-                measured.attachment_of(r),
+                b.attachment,
                 motion,
                 weight,
                 P[None],

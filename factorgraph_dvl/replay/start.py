@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
@@ -44,8 +45,8 @@ class ReplayStart:
 
     Parameters
     ----------
-    frame : LocalFrame
-        Navigation frame of the states.
+    chain : ForwardChain
+        What the segments to come follow.
     body_axes : BodyAxes
         Axes of the body.
     node : int
@@ -70,14 +71,14 @@ class ReplayStart:
         Widths in samples over which gyros and accelerometers are smoothed.
     spurious : ndarray, shape (P, P)
         Spurious information on the parameters, in units of the priors' standard deviations.
-    walking : bool
-        Whether biases walk.
     noise_factors : mapping of str to ndarray
         By label, factors (d,) on the standard deviations that sensors state for their own noise.
     noise : tuple of Noise
         Noise as it is reported.
     errors : CorrelatedErrors
         Correlated errors of the sensors.
+    noise_known : bool
+        Whether the records are long enough to show what persists of the noise.
     clock_zero : float
         When the offsets of clocks hold, s.
     trajectory : Trajectory
@@ -88,7 +89,7 @@ class ReplayStart:
         Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
-    frame: LocalFrame
+    chain: ForwardChain
     body_axes: BodyAxes
     node: int
     time: float
@@ -102,14 +103,24 @@ class ReplayStart:
     own_states: tuple[str, ...]
     windows: tuple[int, int]
     spurious: Array
-    walking: bool
     noise_factors: Mapping[str, Array]
     noise: tuple[Noise, ...]
     errors: CorrelatedErrors
+    noise_known: bool
     clock_zero: float
     trajectory: Trajectory
     findings: tuple[Finding, ...]
     misfit: float
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Navigation frame of the states."""
+        return self.chain.frame
+
+    @property
+    def walking(self) -> bool:
+        """Whether biases walk."""
+        return self.chain.walking
 
     def columns(self, names: Collection[str]) -> np.ndarray:
         """Return the indices of some parameters' components among those of all estimated."""
@@ -195,7 +206,7 @@ def solve_start(
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
-        frame=chain.frame,
+        chain=ForwardChain.of(chain),
         body_axes=trial.body_axes,
         node=last,
         time=time,
@@ -209,10 +220,12 @@ def solve_start(
         own_states=_own_states(trial, chain.frame, interval),
         windows=chain.segments.increments.chosen_windows,
         spurious=spurious,
-        walking=chain.walking,
         noise_factors=problem.white_factors,
         noise=noise_of(problem),
         errors=errors,
+        noise_known=not any(
+            p.density_only and p.label in problem.noise_factors for p in problem.processes
+        ),
         clock_zero=clock_zero,
         trajectory=chain.trajectory(
             evaluation.states, covariances.nodes, trial.body_axes, TRAJECTORY_RATE, since

@@ -34,9 +34,12 @@ _MANY = 20.0
 _LEAST_TIME = 4.0
 # Trials that a correlation time lasts, at most. Chosen: the process is then a constant.
 _CONSTANT = 100.0
-# Trial, s, below which correlation is not searched. Chosen: shorter ones have rival minima, whose
-# costs compare only under one model.
-_SHORTEST = 60.0
+# Standard deviations of a sample variance by which residuals must show less noise than is stated.
+# Chosen: a few in a thousand records are taken for what they are not.
+_SURE = 3.0
+# Measurements, s, below which correlation is not searched. Chosen: trials with rival minima, whose
+# costs compare only under one model, last up to 30 s.
+_SHORTEST = 29.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +104,8 @@ def correlated_noise(
         elif o.label in estimated and np.ptp(when) >= _SHORTEST:
             residuals = np.where(used, evaluation.residuals[i], np.nan)
             found = _fits(o, residuals)
+            factor = problem.noise_factors.get(o.label, 1.0)
+            share = _unseen(o, residuals * factor, found, when)
             if found:
                 if any(fit.time_s < _SHORT for fit in found.values()):
                     followed = _followed_time(problem, evaluation, i)
@@ -112,11 +117,67 @@ def correlated_noise(
                 if (inflation != 1.0).any():
                     long_run[o.label] = inflation
                     long_run_gain += sum(f.gain for f in found.values() if f.time_s < _SHORT)
+            if share.any():
+                missing = share * sigma / factor
+                process = _with_unseen(process, o, missing, sigma, when, len(processes))
+                # White and persisting noise together are what is stated.
+                white = factors.get(o.label, np.ones(sigma.size) * factor)
+                shown = np.maximum(np.sqrt(1.0 - share**2), LEAST_FACTOR)
+                factors[o.label] = np.where(share > 0.0, shown, white)
         if o.scale_walk is not None and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None:
             processes.append(process)
     return CorrelatedNoise(tuple(processes), factors, long_run, gain, long_run_gain)
+
+
+def _unseen(
+    o: Observation,
+    residuals: Array,
+    found: Collection[tuple[int, ...]],
+    time: Array,
+) -> Array:
+    """Return which share of the stated deviation persists although residuals do not show it, (d,).
+
+    Over a record as short as its correlation time the trajectory follows what persists. What
+    residuals lack of the stated variance is there all the same.
+
+    Parameters
+    ----------
+    o : Observation
+        Whose correlation time may be expected.
+    residuals : ndarray, shape (M, d)
+        In stated standard deviations; nan where a component was not used.
+    found : collection of tuple of int
+        Groups of components of which residuals show what persists.
+    time : ndarray, shape (K,), s
+        When it was used.
+    """
+    missing = np.zeros(len(o.components))
+    if o.correlated is None or np.ptp(time) > _MANY * o.correlated.time:
+        return missing
+    for group in set(o.noise_groups).difference(found):
+        own = residuals[:, list(group)]
+        count = int(np.isfinite(own).sum())
+        lack = 1.0 - float(np.nansum(own**2)) / max(count, 1)
+        if count and lack > _SURE * np.sqrt(2.0 / count):
+            missing[list(group)] = np.sqrt(lack)
+    return missing
+
+
+def _with_unseen(
+    process: Process | None, o: Observation, missing: Array, sigma: Array, time: Array, index: int
+) -> Process:
+    """Return a process with a deviation (d,) that residuals do not show in some components."""
+    assert o.correlated is not None
+    tau = np.full(sigma.size, o.correlated.time)
+    own = missing > 0.0
+    if process is not None:
+        missing = np.where(own, missing, process.sigma)
+        tau = np.where(own, tau, process.tau)
+    active = missing > 0.0
+    nodes = node_times(time, float(tau[active].min()), missing[active], sigma[active])
+    return Process(o.label, index, missing, tau, nodes, density_only=True)
 
 
 def _walking(

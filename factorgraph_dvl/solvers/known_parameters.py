@@ -10,8 +10,8 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
+from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS

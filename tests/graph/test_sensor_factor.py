@@ -14,18 +14,20 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.sensor_factor import (
-    AttachedMeasurements,
     Linearized,
     NodeMeasurements,
+    bind,
     measured_nodes,
     measurement_factor,
     sensor_factor,
 )
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import one_segment, preintegrate
-from factorgraph_dvl.imu.propagation import States, attach
+from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 
@@ -39,6 +41,21 @@ FREE = {
     },
     "gnss": {"lever_arm_std_m": [0.1, 0.1, 0.1]},
 }
+ERRORS_FREE = FREE | {
+    "imu": {
+        "gyro_scale_std_ppm": 300,
+        "accel_scale_std_ppm": 300,
+        "gyro_misalignment_std_deg": 0.03,
+        "accel_misalignment_std_deg": 0.03,
+    }
+}
+
+
+def chain_of(imu, frame, seg, gravity_n):
+    """The chain of a segment, without factors."""
+    biases = imu.parameters(0.0)
+    graph = gtsam.NonlinearFactorGraph()
+    return ForwardChain(frame, seg, gravity_n, biases, biases, imu.settings, graph)
 
 
 def node_measurements(time=20.0, **changes):
@@ -58,8 +75,9 @@ def node_measurements(time=20.0, **changes):
     last = int(np.argmin(np.abs(inc.end - time - 1.0))) + 1
     seg = one_segment(inc, first, last)
     states = exact_states(scene, frame, seg.node_time[:1])
-    values, rows, times, count = {}, [], [], 0
+    values, observations = {}, []
     parameters = [p for aid in trial.aids for p in aid.parameters()]
+    parameters += trial.imu.error_parameters()
     for p in parameters:
         true = trial.calibration_truth.get(p.name, np.zeros(p.mean.size)) * p.si
         true = np.broadcast_to(true, p.mean.shape).copy()
@@ -67,19 +85,14 @@ def node_measurements(time=20.0, **changes):
     for aid in trial.aids:
         start, end = seg.node_time
         inside = np.flatnonzero((aid.time >= start) & (aid.time < end - 1e-6))
-        for o in rows_of(aid, inside).observations(frame, "RFU"):
-            rows.append(AttachedMeasurements(o, slice(count, count + o.time.size), o.time))
-            times.append(o.time)
-            count += o.time.size
+        observations += rows_of(aid, inside).observations(frame, "RFU")
     middle = states.p_n + 0.5 * states.v_n
-    measured = NodeMeasurements(
-        attachment=attach(seg, np.concatenate(times), frame.earth_rate),
-        rows=tuple(rows),
-        parameters=tuple(p for p in parameters if p.estimated),
-        fixed={p.name: values[p.name] for p in parameters if not p.estimated},
-        gravity_n=frame.gravity_without_rotation(middle),
-        earth_rate_n=frame.earth_rate,
-    )
+    chain = chain_of(trial.imu, frame, seg, frame.gravity_without_rotation(middle))
+    estimated = [p for p in parameters if p.estimated]
+    some = {p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(estimated)}
+    bound, _ = bind(chain, observations, estimated, some, 0.0)
+    fixed = {p.name: values[p.name] for p in parameters if not p.estimated}
+    measured = NodeMeasurements.of(bound, estimated, fixed)
     free = {p.name: values[p.name] for p in measured.parameters}
     return measured, states, free
 
@@ -97,7 +110,7 @@ def gtsam_values(measured, states, values):
 
 
 def factor_of(measured, first=None):
-    rows = sum(r.time.size * len(r.observation.components) for r in measured.rows)
+    rows = sum(b.weight.size for b in measured.bound)
     weight = np.linspace(1.0, 2.0, rows)
     shared = [keys.calibration(i, p.mean.size) for i, p in enumerate(measured.parameters)]
     return measurement_factor(measured, weight, keys.node(0), keys.bias(0), shared, first)
@@ -105,7 +118,7 @@ def factor_of(measured, first=None):
 
 def test_the_factor_has_no_error_at_the_truth():
     measured, states, values = node_measurements(trial=FREE)
-    assert len(measured.rows) == 3
+    assert len(measured.bound) == 3
     factor = factor_of(measured)
     residual = factor.unwhitenedError(gtsam_values(measured, states, values))
     # What the segment's one gravity and first-order biases leave.
@@ -114,8 +127,11 @@ def test_the_factor_has_no_error_at_the_truth():
     assert np.abs(factor.unwhitenedError(gtsam_values(measured, turned, values))).max() > 1.0
 
 
-def test_the_factor_linearises_as_differences_do():
-    measured, states, values = node_measurements(trial=FREE)
+@pytest.mark.parametrize("claims", [FREE, ERRORS_FREE], ids=["sensors", "imu"])
+def test_the_factor_linearises_as_differences_do(claims):
+    measured, states, values = node_measurements(trial=claims)
+    own = {p.name for p in measured.parameters} & ERRORS.keys()
+    assert bool(own) == ("imu" in claims)
     rng = np.random.default_rng(3)
     states = replace(
         states,
@@ -125,7 +141,8 @@ def test_the_factor_linearises_as_differences_do():
         accel_bias=states.accel_bias + 1e-2,
     )
     for p in measured.parameters:
-        step = rng.normal(0.0, 1e-5 if p.spec.unit == "s" else 0.1, p.mean.size)
+        small = 1e-4 if p.name in own else 1e-5 if p.spec.unit == "s" else 0.1
+        step = rng.normal(0.0, small, p.mean.size)
         value = values[p.name]
         values[p.name] = value @ exp_so3(step) if p.rotation else value + step
     at = gtsam_values(measured, states, values)
@@ -171,6 +188,12 @@ def test_what_was_computed_elsewhere_is_not_taken():
             assert not is_taken(states, values | {p.name: values[p.name] + step}), p.name
 
 
+class StillFrame(LocalFrame):
+    """A frame that does not turn with the Earth."""
+
+    earth_rate = np.zeros(3)
+
+
 def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     # 0.1 rad/s about z and 2 m forward: 0.2 m/s to the left, which is -x of RFU.
     dvl = Dvl(
@@ -179,26 +202,22 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
         np.zeros((1, 3)),
         np.ones((1, 3)),
     )
-    frame = LocalFrame(0.0, 0.0, 0.0)
+    frame = StillFrame(0.0, 0.0, 0.0)
     time = np.arange(1, 201) * 0.01
     gyro = np.tile([0.0, 0.0, 0.1], (time.size, 1))
     trial = simulate(scenario())
     imu = replace(trial.imu, time=time, gyro=gyro, accel=np.tile([0, 0, 9.8], (time.size, 1)))
     inc, _ = increments(imu, (0, 0))
-    seg = one_segment(inc, 50, 100)
-    none = np.zeros(3)
-    measured = NodeMeasurements(
-        attachment=attach(seg, dvl.time, none),
-        rows=(AttachedMeasurements(dvl.observations(frame, "RFU")[0], slice(0, 1), dvl.time),),
-        parameters=tuple(p for p in dvl.parameters() if p.estimated),
-        fixed={p.name: p.mean for p in dvl.parameters() if not p.estimated},
-        gravity_n=np.array([[0.0, 0.0, -9.8]]),
-        earth_rate_n=none,
-    )
+    chain = chain_of(imu, frame, one_segment(inc, 50, 100), np.array([[0.0, 0.0, -9.8]]))
+    estimated = [p for p in dvl.parameters() if p.estimated]
+    fixed = {p.name: p.mean for p in dvl.parameters() if not p.estimated}
+    mean = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in dvl.parameters()}
+    bound, _ = bind(chain, dvl.observations(frame, "RFU"), estimated, {}, 0.0)
+    measured = NodeMeasurements.of(bound, estimated, fixed)
     rest = np.zeros((1, 3))
     states = States(np.eye(3)[None], rest, rest, rest, rest)
-    values = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in measured.parameters}
-    np.testing.assert_allclose(measured.residuals(states, values), [-0.2, 0.0, 0.0], atol=1e-9)
+    residual, _, _ = measured.linearize(states, mean)
+    np.testing.assert_allclose(residual, [-0.2, 0.0, 0.0], atol=1e-9)
 
 
 def test_a_factor_with_the_wrong_number_of_keys_is_refused():

@@ -25,7 +25,7 @@ def test_a_speed_ratio_is_not_taken_for_a_scale_error() -> None:
         f.text for f in survey(dvl_velocity(build_trial(), 1.093)).findings if "times" in f.text
     )
     assert "1.09 times that of the GNSS" in text
-    for contributor in ("not its scale error", "lever arm", "sway"):
+    for contributor in ("not a scale error", "lever arm", "sway"):
         assert contributor in text
 
 

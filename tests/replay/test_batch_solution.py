@@ -8,7 +8,7 @@ import pytest
 from truth import CONFIGS
 
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
-from factorgraph_dvl.replay.batch_solution import BatchSolution
+from factorgraph_dvl.replay.window import BatchSolution
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu

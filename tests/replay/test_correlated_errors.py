@@ -80,12 +80,15 @@ def test_the_start_follows_from_the_last_nodes(errors):
 def test_an_error_is_interpolated_between_the_states(errors):
     observation = SimpleNamespace(label="fast", components=("x",), scale_walk=None)
     other = SimpleNamespace(label="other", components=("x", "y"), scale_walk=None)
-    rows = [
-        SimpleNamespace(observation=observation, at=slice(0, 2), time=np.zeros(2)),
-        SimpleNamespace(observation=other, at=slice(2, 3), time=np.zeros(1)),
+    bound = [
+        SimpleNamespace(
+            observation=o,
+            weight=np.ones((len(tau), len(o.components))),
+            attachment=SimpleNamespace(tau=np.array(tau)),
+        )
+        for o, tau in ((observation, [0.0, 0.15]), (other, [0.1]))
     ]
-    attachment = SimpleNamespace(tau=np.array([0.0, 0.15, 0.1]))
-    before, after = errors.gains(SimpleNamespace(rows=rows, attachment=attachment), 0.2)
+    before, after = errors.gains(SimpleNamespace(bound=bound), 0.2)
     np.testing.assert_allclose(before[:, 2], [0.1, 0.025, 0.0, 0.0])
     np.testing.assert_allclose(after[:, 2], [0.0, 0.075, 0.0, 0.0])
     assert not before[:, :2].any()

@@ -6,13 +6,23 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
+from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.navigator import LocalGravity, Navigator
+
+
+def test_gravity_is_that_of_the_full_model_along_a_track():
+    frame = LocalFrame(0.6, 0.3, 10.0)
+    gravity = LocalGravity(frame)
+    for step in np.linspace(0.0, 3000.0, 200):
+        p = np.array([[step, 0.5 * step, -0.01 * step]])
+        exact = frame.gravity_without_rotation(p)
+        np.testing.assert_allclose(gravity.at(p), exact, rtol=0.0, atol=3e-9)
 
 
 @pytest.fixture
 def navigator(started):
-    return Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
+    return Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0)
 
 
 def position_sigma(navigator, started):
@@ -36,8 +46,7 @@ def test_a_segment_takes_the_motion_on_by_its_length(navigator, started):
 
 def test_without_measurements_the_position_becomes_worse_and_with_them_not(started):
     alone, aided = (
-        Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
-        for _ in range(2)
+        Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0) for _ in range(2)
     )
     before = position_sigma(alone, started)
     for i in range(4):
@@ -50,8 +59,7 @@ def test_without_measurements_the_position_becomes_worse_and_with_them_not(start
 
 def test_late_measurements_correct_what_is_known(started):
     on_time, late = (
-        Navigator(started.start, started.trial.imu, InnovationGate(), lag=20.0, memory=10.0)
-        for _ in range(2)
+        Navigator(started.start, InnovationGate(), lag=20.0, memory=10.0) for _ in range(2)
     )
     kept = {}
     for i in range(3):

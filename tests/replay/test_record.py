@@ -9,8 +9,7 @@ import numpy as np
 from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.replay.record import Recorder
-from factorgraph_dvl.replay.update import Innovations, Update
+from factorgraph_dvl.replay.record import Innovations, Recorder, Update
 
 
 def trajectory(time):

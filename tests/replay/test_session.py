@@ -317,7 +317,6 @@ def test_spurious_information_is_counted_at_whatever_rate_a_sensor_comes(trial):
     for aid in early.aids:
         session.add(aid)
     session.add_imu(early.imu.time, early.imu.gyro, early.imu.accel)
-    session.finish()
     nav = session._navigator
     found = solved_problems(early, state_interval_s=0.2)[0]
     by_node = spurious_information(

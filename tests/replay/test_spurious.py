@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.graph.priors import prior_mean
-from factorgraph_dvl.graph.sensor_factor import state_of
-from factorgraph_dvl.replay.gravity import LocalGravity
-from factorgraph_dvl.replay.measurements import attached
+from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind, state_of
+from factorgraph_dvl.replay.navigator import LocalGravity
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 
@@ -25,10 +24,15 @@ def second(started):
     seg = started.segment(0)
     states = state_of(smoother.state(start.node), smoother.bias(start.node))
     gravity = LocalGravity(start.frame).at(states.p_n)
-    measured, _ = attached(started.aids(seg), seg, gravity, start, values, np.empty(0))
+    chain = start.chain.following(seg, gravity, start.node)
+    observations = [
+        o for aid in started.aids(seg) for o in aid.observations(start.frame, start.body_axes)
+    ]
+    bound, _ = bind(chain, observations, start.parameters, {}, start.clock_zero)
+    measured = NodeMeasurements.of(bound, start.parameters, start.fixed)
     _, _, motions = measured.linearize(states, values)
     P = smoother.joint_covariance()[:9, :9]
-    weights = [np.ones((r.time.size, len(r.observation.components))) for r in measured.rows]
+    weights = [b.weight for b in measured.bound]
     return measured, motions, weights, values, P
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from exactness import worst_relative
 
 from factorgraph_dvl.message import Message
+from factorgraph_dvl.quality.texts import text_of
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.start import solve_start
 from factorgraph_dvl.solvers.batch import settled_minimum
@@ -58,4 +59,4 @@ def test_a_start_is_refused_with_its_reason(started, monkeypatch):
     monkeypatch.setattr("factorgraph_dvl.replay.start._ATTITUDE", 1e-9)
     said = solve_start(started.early, None, 1.0, 0.0, silent, 0.0)
     assert isinstance(said, Message)
-    assert "attitude is known to" in str(said)
+    assert "attitude is known to" in text_of(said)

@@ -42,7 +42,7 @@ def whole(ship):
     # What the clocks have moved beyond the last node since it was bound.
     beyond = {
         b.observation.label: b.observation.time[
-            ~problem.chain.covers(b.time + b.late(minimum.evaluation.parameters))
+            ~problem.chain.covers(b.times(minimum.evaluation.parameters))
         ]
         for b in problem.bound
     }

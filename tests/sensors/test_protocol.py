@@ -9,8 +9,8 @@ from truth import scenario
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import rows_of as geometry_rows
+from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.priors import prior_mean
-from factorgraph_dvl.graph.sensor_factor import ObservationRows
 from factorgraph_dvl.sensors.dvl import DvlVelocity
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.sensors.records import joined, rows_of

@@ -221,6 +221,22 @@ def test_noise_that_persists_at_ten_times_what_is_stated_leaves_a_minimum(fault,
     assert solution.verdict.reasons[0].sensor == label
 
 
+def test_what_residuals_of_a_short_trial_lack_of_the_stated_deviation_persists():
+    """Over 45 s an error over 100 s looks like a constant; white noise lacks nothing."""
+    std = [0.5, 0.5, 0.5]
+    for share, persists in ((0.7, True), (0.0, False)):
+        gnss = {"position_std_m": std, "correlated_share": share}
+        scene = config("seed-a-phase-90", reference_rate_hz=10, gnss=gnss)
+        trial = simulate(scene, 2).until(45.0)
+        solution = solve(trial, rate_hz=1.0)
+        position = noise(solution)["gnss_position"]
+        assert (position.correlated_std is not None) == persists
+        if persists:
+            np.testing.assert_allclose(position.correlated_std, 0.5 * np.sqrt(0.7), rtol=0.15)
+        found = motion_errors(solution.trajectory, trial.reference).position
+        assert found.nees.mean() < 12.0
+
+
 @pytest.mark.slow
 def test_a_short_trial_leaves_the_stated_deviation_of_what_wanders_for_longer():
     """Within 45 s an error over 100 s is nearly constant, and looks as if there were none."""

@@ -32,6 +32,11 @@ TIMES = {
     "seed-a-phase-90": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "correlated noise": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
     "correlated noise, estimated": (40.0, 60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 453.0),
+    # Residuals show what persists of the noise of GNSS once there is a minute of them.
+    **{
+        f"data-sheet-mix-{grade}": (60.0, 90.0, 130.0, 180.0, 250.0, 350.0, 450.0)
+        for grade in ("navigation", "tactical", "mems")
+    },
     "cruise": (60.0, 100.0, 200.0, 300.0, 450.0, 600.0, 900.0, 1200.0),
 }
 # Biases that are hardly better known in the end than before must scatter as the trial states.
@@ -41,6 +46,8 @@ DRAWN = {
     "accel_bias_ug": "draw",
     "accel_bias_std_ug": 100,
 }
+# States a second. With many parameters and few states iSAM2 eliminates all of them at each update.
+RATE = {name: 2.0 for name in TIMES if name.startswith("data-sheet-mix")}
 # Of 4800 s.
 END = 1200.0
 DVL = 7
@@ -50,6 +57,7 @@ DVL = 7
 class Run:
     """Of one seed: NEES of the DVL's components and of the motion at some times, and the end."""
 
+    name: str
     nees: np.ndarray
     motion: np.ndarray
     apart: np.ndarray
@@ -73,7 +81,7 @@ def one(job):
     trial = up_to(simulate(scene_of(name), seed), END)
     if name == "correlated noise":
         trial = replace(trial, noise="stated")
-    session, updates = Replay(trial, rate_hz=1.0), []
+    session, updates = Replay(trial, rate_hz=RATE.get(name, 1.0)), []
     imu = trial.imu
     edges = np.arange(0.0, imu.time[-1] + 1.0, 1.0)
     for a, b in pairwise(edges):
@@ -95,13 +103,15 @@ def one(job):
         P = u.calibration.covariance[:DVL, :DVL]
         nees.append(error @ np.linalg.solve(P, error))
         errors = motion_errors(u.state, trial.reference)
-        motion.append([v.nees[0] for v in (errors.position, errors.velocity, errors.attitude)])
-    batch = solve(replace(trial, noise="stated"))
+        # By the IMU's clock a state may lie where the reference has no epochs around it.
+        kinds = (errors.position, errors.velocity, errors.attitude)
+        motion.append([v.nees[0] if v.nees.size else np.nan for v in kinds])
+    batch = solve(trial if name in RATE else replace(trial, noise="stated"))
     value = np.concatenate([e.value for e in batch.estimates])
     last = np.concatenate([e.value for e in updates[-1].calibration.estimates])
     std = np.sqrt(np.diag(batch.covariance))
     ratio = np.sqrt(np.diag(updates[-1].calibration.covariance)) / std
-    return Run(np.array(nees), np.array(motion), (last - value) / std, ratio, time[0])
+    return Run(name, np.array(nees), np.array(motion), (last - value) / std, ratio, time[0])
 
 
 @pytest.fixture(scope="module", params=TIMES)
@@ -126,6 +136,9 @@ def test_the_calibration_is_as_good_as_stated_all_along(runs):
 
 
 def test_the_motion_is_as_good_as_stated_all_along(runs):
-    low, high = nees_band(3, len(runs), 1.0 - _RARE)
-    mean = np.mean([r.motion for r in runs], axis=0)
+    motion = np.array([r.motion for r in runs])
+    low, high = nees_band(3, int(np.isfinite(motion).sum(axis=0).min()), 1.0 - _RARE)
+    mean = np.nanmean(motion, axis=0)
+    # What persists for long keeps the deviation that is stated: positions may be better than σ.
+    low = np.array([0.0 if runs[0].name in RATE else low, low, low])
     assert np.all((mean > low) & (mean < high)), mean

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from truth import scenario
 
-from factorgraph_dvl.replay.history import RecordHistory
+from factorgraph_dvl.replay.initializer import RecordHistory
 from factorgraph_dvl.simulation import simulate
 
 

@@ -11,8 +11,8 @@ from truth import scenario
 from factorgraph_dvl.estimates import Estimate, Trajectory
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.calibration import CalibrationEstimate
-from factorgraph_dvl.replay.update import Update
-from factorgraph_dvl.replay.verdict_as_it_goes import VerdictAsItGoes
+from factorgraph_dvl.replay.playback import VerdictAsItGoes
+from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.simulation import simulate
 
 NOWHERE = Trajectory(*(np.zeros(0) for _ in range(7)))
