@@ -112,8 +112,8 @@ def _impossible_scale(e: Estimate) -> list[Finding]:
     value, std, name = e.value[worst], e.std[worst], e.component_names[worst]
     cause = scale_cause(float(value))
     if cause is None:
-        numbers = {"name": name, "value": value, "std": std}
-        text = message("impossible_scale.larger", **numbers, limit=100.0 * _LARGEST_SCALE)
+        limit = 100.0 * _LARGEST_SCALE
+        text = message("impossible_scale.larger", name=name, value=value, std=std, limit=limit)
     else:
         text = message("impossible_scale.caused", name=name, value=value, std=std, cause=cause)
     return [Finding(Code.IMPOSSIBLE_SCALE, text, parameter=e.name)]

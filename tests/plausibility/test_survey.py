@@ -22,9 +22,11 @@ def test_a_good_trial_has_no_problems() -> None:
 
 def test_a_speed_ratio_is_not_taken_for_a_scale_error() -> None:
     (text,) = (
-        f.text for f in survey(dvl_velocity(build_trial(), 1.093)).findings if "times" in f.text
+        f.text
+        for f in survey(dvl_velocity(build_trial(), 1.093)).findings
+        if "speed ratio" in f.text
     )
-    assert "1.09 times that of the GNSS" in text
+    assert "speed ratio 1.09 to the GNSS" in text
     for contributor in ("not a scale error", "lever arm", "sway"):
         assert contributor in text
 
