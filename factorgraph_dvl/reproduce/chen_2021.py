@@ -443,7 +443,7 @@ CHEN_2021 = Paper(
     "on single beacon",
     (
         Entry("figure 1", "geometry of range and range rate", "`sensors/beacon`", _geometry),
-        Entry("figure 2", "two tracks fit the same ranges", "`ranging/hypotheses`", _mirror),
+        Entry("figure 2", "two tracks fit the same ranges", "`solvers/hypotheses`", _mirror),
         Entry("figure 3", "v_r / u is the cosine of the bearing", "`sensors/beacon`", _geometry),
         Entry("start (eq. 7, lost)", "mirror pair from the ranges", _PAIR, _pair),
         Entry("equations (lost)", "4SV-2OB and 4SV-3OB", "`baselines/single_beacon`", _model),

@@ -97,7 +97,10 @@ def priors(problem):
 def noise_of_the_imu(problem):
     """Return log det of the noise of gyros and accelerometers, up to a constant: 3 and 6 rows."""
     imu = problem.chain.imu
-    own = 3.0 * np.log(imu.gyro_noise_deg_sqrt_h) + 6.0 * np.log(imu.accel_noise_ug_sqrt_hz)
+    # rad/s/√Hz and m/s²/√Hz.
+    gyro = np.radians(imu.gyro_noise_deg_sqrt_h) / 60.0
+    accel = imu.accel_noise_ug_sqrt_hz * 1e-6 * STANDARD_GRAVITY
+    own = 3.0 * np.log(gyro) + 6.0 * np.log(accel)
     return 2.0 * problem.chain.count * own
 
 
