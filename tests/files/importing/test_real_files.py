@@ -112,7 +112,8 @@ def test_leaves_nothing_beside_the_input(imported):
 
 
 UNSETTLED = pytest.mark.xfail(
-    strict=True,
+    # Which of them settle is not known of every state of the solver.
+    strict=False,
     reason="rare fixes and a compass of 2 deg: the strengths of the motion do not settle, or "
     "misfits are taken for a change along the trial; the verdict is `do not use`",
 )
