@@ -18,7 +18,6 @@ from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.hypotheses import follow, reported, schedule
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.motion_strengths import Strengths
 from factorgraph_dvl.solvers.planar_setup import PlanarSetup, Track, planar_setup
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
@@ -105,7 +104,7 @@ class PlanarPreparation:
     def first_tilt(self, values: Mapping[str, Array]) -> None:
         """Return None: the volume of the states does not depend on the constants."""
 
-    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
+    def strengths(self, problem: Problem, minimum: Minimum) -> None:
         """Return None: how smooth the motion is, its records say."""
 
 

@@ -97,9 +97,7 @@ class Prepared(Protocol):
     def first_tilt(self, values: Mapping[str, Array]) -> Tilt | None:
         """Return the gradient of the states' volume by the constants to start from."""
 
-    def strengths(
-        self, problem: Problem, minimum: Minimum, before: Strengths | None
-    ) -> Strengths | None:
+    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths | None:
         """Return the strengths of the motion's prior, None where the chain has none."""
 
 
@@ -162,7 +160,7 @@ class Preparation:
     def first_tilt(self, values: Mapping[str, Array]) -> None:
         """Return None: the volume of the states hardly depends on the constants."""
 
-    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> None:
+    def strengths(self, problem: Problem, minimum: Minimum) -> None:
         """Return None: the IMU ties the nodes."""
 
     def chain(self, states: States) -> InertialChain:

@@ -152,7 +152,7 @@ class PreparationWithoutImu:
         """Return the gradient of the states' volume by the constants to start from."""
         return self.tilt or Tilt.holding(self.parameters, values)
 
-    def strengths(self, problem: Problem, minimum: Minimum, before: Strengths | None) -> Strengths:
+    def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
         found = motion_strengths(problem, minimum, self.phase, self.least_gain)
         chain, values = found.chain, minimum.evaluation.parameters

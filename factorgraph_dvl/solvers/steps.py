@@ -99,7 +99,6 @@ class MotionStrengths:
     """Strengths of a motion's prior, of processes and of white noise, by their likelihood."""
 
     name = "strengths of motion and noise"
-    _last: Strengths | None = None
     _settled_for: tuple[Any, ...] | None = None
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
@@ -109,13 +108,12 @@ class MotionStrengths:
         own = model.parameters, model.robust_weights, _labels(model)
         if _are_those(own, self._settled_for):
             return
-        found = model.prepared.strengths(at.problem, at.minimum, self._last)
+        found = model.prepared.strengths(at.problem, at.minimum)
         if found is None:
             self._settled_for = own
             return
-        self._last = found
         if found.same:
-            self._settled_for, self._last = own, None
+            self._settled_for = own
         for share in _SHARES:
             yield _with_strengths(model, found, share)
 
