@@ -67,7 +67,13 @@ def report(
 def _load(folder: Path) -> Result:
     """Return what a solution folder holds."""
     from factorgraph_dvl.files.run_file import read_run
-    from factorgraph_dvl.files.solution_folder import load_solution, read_halves, read_history
+    from factorgraph_dvl.files.solution_folder import (
+        CHECK_FILE,
+        load_solution,
+        read_check,
+        read_halves,
+        read_history,
+    )
     from factorgraph_dvl.report.html.content import Result
 
     run = read_run(folder)
@@ -79,6 +85,8 @@ def _load(folder: Path) -> Result:
         crosscheck=_read_json(folder / "crosscheck" / "crosscheck.json"),
         dead_reckoning=_read_json(folder / "deadreckon" / "deadreckon.json"),
         halves=read_halves(folder),
+        check=_read_json(folder / CHECK_FILE),
+        check_table=read_check(folder),
     )
 
 
@@ -115,14 +123,25 @@ def write_report(
 ) -> None:
     """Write run.json, and report.html; a page that fails is a warning: results are worth more."""
     from factorgraph_dvl.files.run_file import RUN_FILE, encode_run
-    from factorgraph_dvl.files.solution_folder import REPORT_FILE, read_halves
+    from factorgraph_dvl.files.solution_folder import (
+        CHECK_FILE,
+        REPORT_FILE,
+        read_check,
+        read_halves,
+    )
     from factorgraph_dvl.report.html.content import Result
     from factorgraph_dvl.report.html.page import report_page
 
     (folder / RUN_FILE).write_bytes(encode_run(run))
     try:
         result = Result(
-            as_text(name), solution, _builtins(run), history, halves=read_halves(folder)
+            as_text(name),
+            solution,
+            _builtins(run),
+            history,
+            halves=read_halves(folder),
+            check=_read_json(folder / CHECK_FILE),
+            check_table=read_check(folder),
         )
         (folder / REPORT_FILE).write_text(report_page(result), encoding="utf-8")
     except Exception as error:

@@ -47,6 +47,18 @@ INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 BEAM_ANGLES_FILE = "beam_angles.csv"
 HALVES_FILE = "halves.csv"
+CHECK_FILE = "check.json"
+CHECK_TABLE = "check.parquet"
+# Residuals of the DVL, and errors of dead reckoning, before and after calibration.
+CHECK_COLUMNS = (
+    "time_s",
+    *(
+        f"residual_{axis}_{when}_m_s"
+        for when in ("before", "after")
+        for axis in ("forward", "starboard", "down")
+    ),
+)
+CHECK_ERRORS = ("track_error_before_m", "track_error_after_m")
 REPORT_FILE = "report.html"
 # Of trajectories that were exported, before the name of their format.
 EXPORT_STEM = "trajectory"
@@ -55,7 +67,7 @@ FIGURES_FOLDER = "figures"
 OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
-    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
+    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE, CHECK_FILE, CHECK_TABLE),
     *(RUN_FILE, REPORT_FILE),
     *(
         f"{EXPORT_STEM}.{name}"
@@ -279,6 +291,20 @@ def read_halves(path: Path) -> dict[str, Any]:
     """
     file = path / HALVES_FILE
     return read_table(file, read_header(file), source=str(file)) if os.path.lexists(file) else {}
+
+
+def read_check(path: Path) -> dict[str, Any]:
+    """Return the columns of check.parquet; nothing where there is no such file.
+
+    Raises
+    ------
+    DataError
+        If it does not contain what it should.
+    """
+    file = path / CHECK_TABLE
+    if not os.path.lexists(file):
+        return {}
+    return read_table(file, CHECK_COLUMNS, [CHECK_ERRORS], source=str(file))
 
 
 def trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:

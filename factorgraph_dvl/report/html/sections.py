@@ -60,13 +60,6 @@ _MANOEUVRES = {
     "turns": "turns to both sides at 3 deg/s",
     "pitching": "pitching by 10 deg, up and down",
 }
-_ERRORS = (
-    ("end_point_error_m", "end point error, m"),
-    ("end_point_percent", "end point error, % of distance"),
-    ("global_error_m", "largest error, m"),
-    ("rms_error_m", "RMS error, m"),
-    ("distance_m", "distance, m"),
-)
 
 
 _FOR_EXPERTS = (
@@ -499,21 +492,6 @@ def crosscheck_section(result: Result) -> Section | None:
 
 def _side(check: Mapping[str, Any], side: str) -> str:
     return f"{side.upper()}: {check.get(side, {}).get('solver', '')}"
-
-
-def dead_reckoning_section(result: Result) -> Section | None:
-    """Return errors of dead reckoning before and after calibration, if they were measured."""
-    found = result.dead_reckoning
-    if not found or "end_point_error_m" not in found:
-        return None
-    before = found.get("uncalibrated", {})
-    rows = [[both(name), _text(before.get(key)), _text(found.get(key))] for key, name in _ERRORS]
-    header = [Html(""), both("before calibration"), both("after calibration")]
-    return section(
-        "Dead reckoning",
-        table(header, rows, label="Dead reckoning", numeric=(1, 2)),
-        key="dead-reckoning",
-    )
 
 
 def _text(value: Any) -> str:
