@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
 
 
+class ReportLanguage(StrEnum):
+    """Languages of a report on paper."""
+
+    ENGLISH = "en"
+    CHINESE = "zh"
+
+
 def report(
     folders: Annotated[
         list[Path], typer.Argument(metavar="DIR...", help="Solution folders.", show_default=False)
@@ -25,7 +33,9 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="Page to write; by default report.html in the folder."
+            "--out",
+            metavar="FILE",
+            help="File to write; by default report.html or report.pdf in the folder.",
         ),
     ] = None,
     force: Force = False,
@@ -33,27 +43,47 @@ def report(
         bool,
         typer.Option("--redact", help="Leave out positions, names of trials and names of files."),
     ] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write three pages of A4 to sign: report.pdf.")
+    ] = False,
+    language: Annotated[
+        ReportLanguage, typer.Option("--language", help="Language of the PDF.")
+    ] = ReportLanguage.ENGLISH,
 ) -> None:
     """Write the page of a result, or a page that compares several results.
 
     A page is one file that works offline. A cross-check in DIR/crosscheck and dead reckoning in
-    DIR/deadreckon are shown too.
+    DIR/deadreckon are shown too. `--pdf` writes the result for paper.
 
     Examples:
       factorgraph-dvl report out
+
+      factorgraph-dvl report out --pdf
 
       factorgraph-dvl report out-batch out-kalman --out comparison.html
     """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.files.folders import write_file
-    from factorgraph_dvl.files.solution_folder import REPORT_FILE
+    from factorgraph_dvl.files.solution_folder import PDF_FILE, REPORT_FILE
+    from factorgraph_dvl.report.html.content import redact as redacted_result
     from factorgraph_dvl.report.html.page import comparison_page, report_page
+    from factorgraph_dvl.report.pdf.document import write_pdf
 
+    if pdf and len(folders) > 1:
+        raise ConfigError("--pdf shows one result", expected="one solution folder")
     if out is None and len(folders) > 1:
         raise ConfigError(
             "--out is missing", expected="the page to write, such as --out comparison.html"
         )
     results = [_load(folder) for folder in folders]
+    if pdf:
+        (shown,) = map(redacted_result, results) if redact else results
+        file = out or folders[0] / PDF_FILE
+        write_file(
+            file, lambda path: write_pdf(shown, path, language.value), force=force or out is None
+        )
+        print_file(file)
+        return
     if len(results) == 1:
         page = report_page(results[0], redacted=redact)
     else:

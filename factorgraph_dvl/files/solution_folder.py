@@ -60,6 +60,7 @@ CHECK_COLUMNS = (
 )
 CHECK_ERRORS = ("track_error_before_m", "track_error_after_m")
 REPORT_FILE = "report.html"
+PDF_FILE = "report.pdf"
 # Of trajectories that were exported, before the name of their format.
 EXPORT_STEM = "trajectory"
 FIGURES_FOLDER = "figures"
@@ -68,7 +69,7 @@ OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
     *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE, CHECK_FILE, CHECK_TABLE),
-    *(RUN_FILE, REPORT_FILE),
+    *(RUN_FILE, REPORT_FILE, PDF_FILE),
     *(
         f"{EXPORT_STEM}.{name}"
         for name in (
