@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
-import typer
-
 from factorgraph_dvl.cli.console import stdout
-from factorgraph_dvl.cli.options import Anyway
+from factorgraph_dvl.cli.options import Anyway, CalibrationPath
 from factorgraph_dvl.cli.verdict import end_with
 
 
 def instrument(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
-    ],
+    calibration: CalibrationPath,
     anyway: Anyway = False,
 ) -> None:
     """Print a calibration in the form your instrument expects, with its verdict.

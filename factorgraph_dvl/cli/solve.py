@@ -227,6 +227,7 @@ def _checked(
     from factorgraph_dvl.analysis.comparison.halves import halves_of
     from factorgraph_dvl.analysis.dead_reckoning.check import Data, check_calibration
     from factorgraph_dvl.errors import FactorgraphDvlError
+    from factorgraph_dvl.estimates import values_of
     from factorgraph_dvl.solvers.batch import solve as run_batch
 
     if trial.log is None or trial.position_sensor is None:
@@ -238,9 +239,8 @@ def _checked(
         if first.verdict.grade != "do not use":
             candidates.insert(0, (rest, first, "second half"))
     for part, found, data in candidates:
-        values = {e.name: e.value for e in found.estimates}
         with suppress(FactorgraphDvlError):
-            return check_calibration(part, solution, values, data)
+            return check_calibration(part, solution, values_of(found.estimates), data)
     return None
 
 

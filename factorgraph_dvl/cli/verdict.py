@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
 
 
-def print_verdict(solution: Solution) -> None:
+def print_verdict(verdict: Verdict) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
     from factorgraph_dvl.report.tables import verdict_line
 
-    verdict = solution.verdict
     if events.active():
         events.emit(events.Judged(verdict.grade, list(map(found_event, verdict.reasons))))
         return
@@ -50,7 +49,7 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
     from factorgraph_dvl.report.entries import entries_table
 
-    print_verdict(solution)
+    print_verdict(solution.verdict)
     reasons = solution.verdict.reasons[1:]
     if not events.active():
         for reason in reasons[: _REASONS - 1]:

@@ -16,7 +16,6 @@ from factorgraph_dvl.plausibility.earlier_calibration import CONTRADICTED_P, DOU
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import JointPrior
-from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
@@ -116,16 +115,8 @@ def halves_of(trial: Trial) -> tuple[Trial, Trial]:
         )
     record = trial.body_sensor.time
     middle = 0.5 * float(record[0] + record[-1])
-    first, second = (
-        replace(
-            trial,
-            imu=trial.imu and rows_of(trial.imu, (trial.imu.time >= middle) == later),
-            gnss=rows_of(trial.gnss, (trial.gnss.time >= middle) == later),
-            dvl=trial.dvl and rows_of(trial.dvl, (trial.dvl.time >= middle) == later),
-            others=tuple(rows_of(aid, (aid.time >= middle) == later) for aid in trial.others),
-        )
-        for later in (False, True)
-    )
+    first = trial.until(float(np.nextafter(middle, -np.inf)))
+    second = trial.until(np.inf, since=middle)
     imu = second.imu
     if imu is not None:
         imu = replace(imu, prior=imu.prior_after(middle - float(record[0])))

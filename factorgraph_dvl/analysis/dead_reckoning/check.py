@@ -19,6 +19,7 @@ from factorgraph_dvl.analysis.dead_reckoning.integration import (
     body_velocity,
     mounting_of,
 )
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.rotations import frd_from_body, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.units import DEG_PER_HOUR
@@ -78,7 +79,7 @@ def check_calibration(
     Raises
     ------
     DataError
-        As `before_after`.
+        As `before_after`, and with fewer than two pings within the trajectory.
     """
     orientation_at = _orientation(trial, solution)
     frd = frd_from_body(trial.body_axes)
@@ -95,20 +96,29 @@ def check_calibration(
         return time[used], ((predicted - v_b) @ frd.T)[used]
 
     corrected, _ = with_calibration(trial, values)
+    tracks = before_after(trial, values, orientation_at)
     time, after = residuals(corrected, values if corrected is trial else None)
     stamp, before = residuals(trial, None)
+    if min(time.size, stamp.size) < 2:
+        raise DataError(
+            "fewer than two pings to compare with the trajectory",
+            where="DVL",
+            expected="pings with a lock within the trajectory",
+        )
     return Check(
         data=data,
         time=time,
         before=interpolate(time, stamp, before),
         after=after,
-        tracks=before_after(trial, values, orientation_at),
+        tracks=tracks,
     )
 
 
 def _velocity(trajectory: Trajectory, time: Array) -> Array:
     """Return velocities (M, 3), m/s, at times; nan beyond the trajectory."""
     known = np.isfinite(trajectory.velocity).all(axis=1)
+    if known.sum() < 2:
+        return np.full((time.size, 3), np.nan)
     spline = CubicSpline(trajectory.time[known], trajectory.velocity[known], extrapolate=False)
     return np.asarray(spline(time))
 
