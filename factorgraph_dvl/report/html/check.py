@@ -37,6 +37,7 @@ def check_plots(result: Result) -> list[Plot]:
         Plot(
             f"check-{when}", f"DVL residual {when} calibration", "m/s", AXES, time,
             np.stack([columns[f"residual_{axis}_{when}_m_s"] for axis in AXES], axis=1),
+            axis="DVL residual",
         )
         for when in ("before", "after")
     ]  # fmt: skip
@@ -46,7 +47,9 @@ def check_plots(result: Result) -> list[Plot]:
         )
         names = ["before calibration", "after calibration"]
         title = "Position error of dead reckoning"
-        plots.append(Plot("check-track", title, "m", names, time, values, log=True))
+        plots.append(
+            Plot("check-track", title, "m", names, time, values, log=True, axis="position error")
+        )
     return plots
 
 
