@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import UNSET
 
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError, printable
+from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.files.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.files.folders import SETTINGS_FILE, new_folder
 from factorgraph_dvl.files.initial_conditions import (
@@ -329,12 +330,38 @@ def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
     return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
 
 
+_IMPORT = "Make one of files of instruments with: factorgraph-dvl import FILE… --out TRIAL"
+
+
 def locate(path: Path) -> tuple[Path, Path]:
     """Return a trial's folder and its trial.yaml."""
     if not path.exists():
         raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
-    file = path / SETTINGS_FILE if path.is_dir() else path
-    return file.parent, file
+    if not path.is_dir():
+        if path.suffix.lower() not in (".yaml", ".yml"):
+            raise DataError(
+                "not a trial",
+                where=str(path),
+                expected=f"a trial folder, or the {SETTINGS_FILE} in it",
+                hint=_IMPORT,
+            )
+        return path.parent, path
+    file = path / SETTINGS_FILE
+    if not file.exists():
+        if (path / CALIBRATION_FILE).exists():
+            raise DataError(
+                "the folder of a result, not of a trial",
+                where=str(path),
+                expected=f"a folder with {SETTINGS_FILE}",
+                hint="Show a result with: factorgraph-dvl report DIR",
+            )
+        raise DataError(
+            f"the folder has no {SETTINGS_FILE}",
+            where=str(path),
+            expected="a trial folder",
+            hint=_IMPORT,
+        )
+    return path, file
 
 
 def _reference_of(tables: Path | Tables, settings: TrialSettings) -> Reference | None:
