@@ -305,7 +305,7 @@ BAD_TABLES = {
         "gnss.csv",
         1,
         "0.5,108,34,0,1,1,1,,,,,,",
-        "Latitude and longitude seem to be swapped",
+        "line 2: lat_deg = 108 is out of range; expected -90 to 90 deg. Latitude and longitude",
     ),
     "half a ping": ("dvl.csv", 1, "0.5,1,,3,,,", "line 2: only some of vel_x_m_s"),
     "no column": (
