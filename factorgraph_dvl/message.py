@@ -45,7 +45,7 @@ def message(key: str, **values: object) -> Message:
     Parameters
     ----------
     key : str
-        As in `Message`.
+        Key as in `Message`.
     **values : str, float, Message, ndarray or sequence of these
         Values by the names of the template.
     """

@@ -91,7 +91,7 @@ class StaticNoise:
     Parameters
     ----------
     duration, rate : float
-        Of the stretch without gaps that was used, s, Hz.
+        Duration and rate of the stretch without gaps that was used, s, Hz.
     gyro, accel : tuple of AxisNoise
         X, y, z.
     """

@@ -117,15 +117,16 @@ def calibrate(
     Parameters
     ----------
     trial : Trial
-        With IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS with a
-        compass, is what the DVL is compared with. Or a planar trial, with its first position.
+        Trial with IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS
+        with a compass, is what the DVL is compared with. Or a planar trial, with its first
+        position.
     method : Method, optional
-        By default `point-set`, and `4sv-3ob` for a planar trial.
-        `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
-        `nine-state-linear` (as printed), `nine-state-ukf`, `wahba`, `least-squares`, or the fits
-        `joyce` and `pollard-read` for ships. These take beams without a DVL beside them for the
-        velocity that they amount to. `star`, or `liu-2020` as printed; `beams`, an extended
-        Kalman filter of single beams; or, for planar trials, `4sv-2ob` or `4sv-3ob`.
+        Method; by default `point-set`, and `4sv-3ob` for a planar trial. `point-set` (seven
+        states), `luo-2024` (the same as printed), `nine-state`, `nine-state-linear` (as printed),
+        `nine-state-ukf`, `wahba`, `least-squares`, or the fits `joyce` and `pollard-read` for
+        ships. These take beams without a DVL beside them for the velocity that they amount to.
+        `star`, or `liu-2020` as printed; `beams`, an extended Kalman filter of single beams; or,
+        for planar trials, `4sv-2ob` or `4sv-3ob`.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional

@@ -51,7 +51,7 @@ def as_printed(
     points : Points
         The two point sets, of SINS/GNSS without smoothing.
     misalignment, scale, lever_arm : Parameter
-        With their priors; one scale for the three axes.
+        Misalignment, scale and lever arm with their priors; one scale for the three axes.
     """
     parameters = (misalignment, scale, lever_arm)
     prior = prior_of(parameters)

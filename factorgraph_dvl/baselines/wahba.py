@@ -29,9 +29,9 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
     points : Points
         The two point sets.
     misalignment, scale : Parameter
-        With their priors.
+        Misalignment and scale with their priors.
     lever_arm : ndarray, shape (3,)
-        Of the DVL, m, taken as known.
+        Lever arm of the DVL, m, taken as known.
     """
     parameters = (misalignment, scale)
     prior = prior_of(parameters)

@@ -74,9 +74,9 @@ def write_seeds(
     found : MonteCarlo or None
         Statistics of the seeds.
     records : sequence of SeedRecord
-        Of the seeds.
+        Records of the seeds.
     scenario : path-like
-        That was simulated.
+        Scenario that was simulated.
     out : path-like
         Folder of the campaign.
     """

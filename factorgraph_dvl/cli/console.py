@@ -113,9 +113,9 @@ class ProgressLine:
         stage : str
             What begins, or goes on.
         iteration : int, optional
-            Of the stage.
+            Iteration of the stage.
         cost : float, optional
-            Of the iteration.
+            Cost of the iteration.
         done : float, optional
             Share of the run that is done; by default that of the stage, if it is a solver's.
         """

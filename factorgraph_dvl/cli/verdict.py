@@ -44,7 +44,7 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     maker : str
         Maker of the DVL, empty if not known.
     page : Path
-        Of the result.
+        Page of the result.
     """
     from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
     from factorgraph_dvl.report.entries import entries_table

@@ -130,9 +130,9 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
     Parameters
     ----------
     path : path-like
-        Of the file, or of the solution folder that holds it.
+        Path of the file, or of the solution folder that holds it.
     body_axes : BodyAxes, default 'RFU'
-        That it is in where it does not say so.
+        Body axes that it is in where it does not say so.
 
     Raises
     ------

@@ -248,7 +248,7 @@ def read_truth(path: Path | str) -> dict[str, Array]:
     Parameters
     ----------
     path : path-like
-        Of a JSON or YAML file, such as the `truth.json` of a trial folder.
+        Path of a JSON or YAML file, such as the `truth.json` of a trial folder.
 
     Returns
     -------
@@ -278,10 +278,10 @@ def read_calibration_values(
     Parameters
     ----------
     path : path-like
-        Of a calibration.json, of the solution folder that holds it, or of a JSON or YAML file of
-        calibration values.
+        Path of a calibration.json, of the solution folder that holds it, or of a JSON or YAML file
+        of calibration values.
     body_axes : BodyAxes
-        That the values must be in.
+        Body axes that the values must be in.
     anyway : bool, default False
         Read them also if they are graded `do not use`.
 
@@ -316,9 +316,9 @@ def own_calibration(path: Path, body_axes: BodyAxes) -> Calibration | None:
     Parameters
     ----------
     path : path-like
-        As for `read_calibration_values`.
+        Path as for `read_calibration_values`.
     body_axes : BodyAxes
-        Of a file that does not state them.
+        Body axes of a file that does not state them.
     """
     whole = path.is_dir() or (
         path.suffix.lower() == ".json" and b'"covariance"' in read_calibration_bytes(path)

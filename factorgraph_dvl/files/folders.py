@@ -41,7 +41,7 @@ def write_file(path: Path, write: Callable[[Path], object], *, force: bool = Fal
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     write : callable of path-like, object
         Writes the file to a path of the same name, and others beside it.
     force : bool, default False
@@ -96,7 +96,7 @@ def claim(
     Parameters
     ----------
     path : path-like
-        Of the folder to be written.
+        Path of the folder to be written.
     force : bool, default False
         Replace what an earlier run wrote there.
     owned : sequence of str, optional
@@ -150,7 +150,7 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
     Parameters
     ----------
     path, force, owned : path-like, bool, sequence of str
-        As in `claim`.
+        Path, force and owned as in `claim`.
 
     Raises
     ------

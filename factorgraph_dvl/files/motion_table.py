@@ -33,7 +33,7 @@ def read_reference(path: Path, source: str = "") -> Reference:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     source : str, optional
         Its name in messages.
 
@@ -70,7 +70,7 @@ def read_motion(
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     source : str, optional
         Its name in messages.
     required, optional : sequence of str, sequence of sequence of str, optional

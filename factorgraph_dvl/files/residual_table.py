@@ -21,7 +21,7 @@ def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
     Parameters
     ----------
     residuals : sequence of Residuals
-        At least one.
+        Residuals; at least one.
     """
     parts = []
     for r in residuals:

@@ -114,9 +114,9 @@ def save_solution(
     Parameters
     ----------
     solution : Solution
-        To write.
+        Solution to write.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace the solution that is there.
     extra : callable, optional
@@ -184,11 +184,11 @@ def write_history(
     Parameters
     ----------
     folder : path-like
-        To write into.
+        Folder to write into.
     time : ndarray, shape (H,), s
-        Of the updates.
+        Times of the updates.
     names : sequence of str
-        Of the n components, as in `covariance.order`.
+        Names of the n components, as in `covariance.order`.
     std : ndarray, shape (H, n)
         Standard deviations, in reported units.
     values : ndarray, shape (H, n), optional
@@ -212,7 +212,7 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
     Parameters
     ----------
     folder : path-like
-        To write into.
+        Folder to write into.
     time, latency : ndarray, shape (H,), s
         When the updates came, and how long each took.
     solved : ndarray, shape (H,)
@@ -231,7 +231,7 @@ def load_solution(path: Path | str) -> Solution:
     Parameters
     ----------
     path : path-like
-        Of the folder.
+        Path of the folder.
 
     Raises
     ------

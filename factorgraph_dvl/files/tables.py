@@ -43,7 +43,7 @@ def read_table(
     Parameters
     ----------
     path : path-like
-        Of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
+        Path of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
     required : sequence of str
         Columns that must be there. Others than those asked for are not read.
     optional : sequence of sequence of str, optional
@@ -98,7 +98,7 @@ def columns_of(
     table : mapping of str to array_like, or DataFrame
         Whatever has columns by name.
     required, optional : sequence of str, sequence of sequence of str
-        As of `read_table`.
+        Columns as of `read_table`.
     source : str
         Name of the table in messages.
 
@@ -207,7 +207,7 @@ class TableWriter:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     """
 
     def __init__(self, path: Path) -> None:

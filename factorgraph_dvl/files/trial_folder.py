@@ -83,7 +83,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     Parameters
     ----------
     path : path-like
-        Of the folder, or of the trial.yaml in it.
+        Path of the folder, or of the trial.yaml in it.
     anyway : bool, default False
         Start from the calibrations in `dvl.calibration` and `imu.calibration` also if they are
         graded `do not use`; the trial notes it.
@@ -118,13 +118,13 @@ def assembled(
     Parameters
     ----------
     settings : TrialSettings
-        As in trial.yaml.
+        Settings as in trial.yaml.
     tables : Path or mapping of str to mapping
         Folder with the tables of the sensors, or the tables by section.
     folder : Path
         Where `dvl.calibration` is looked for.
     anyway : bool, default False
-        As of `load_trial`.
+        Option as of `load_trial`.
     """
     initial = settings.initial
     kinds = {aid.section: aid for aid in aid_types()}
@@ -173,7 +173,7 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
     Parameters
     ----------
     path : path-like
-        Of the folder, or of the trial.yaml in it.
+        Path of the folder, or of the trial.yaml in it.
 
     Returns
     -------
@@ -219,16 +219,16 @@ def save_trial(
     Parameters
     ----------
     trial : Trial
-        To write.
+        Trial to write.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace a trial that `save_trial` or `simulate` wrote; never another one, whose tables may
         be the only ones.
     parquet : bool, default False
         Write the sensors' tables as Parquet.
     seed : int, optional
-        Of a trial that was simulated: trial.yaml says so.
+        Seed of a trial that was simulated: trial.yaml says so.
 
     Raises
     ------

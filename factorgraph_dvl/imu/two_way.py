@@ -38,7 +38,8 @@ class TwoWay:
     Parameters
     ----------
     forward, backward : Attachment
-        To the node before, and to the node after: its times and increments are negative.
+        Attachments to the node before, and to the node after: its times and increments are
+        negative.
     share, share_rate : ndarray, shape (M,)
         Share s of the motion carried back, and its time derivative, 1/s.
     bend : ndarray, shape (M,), s
@@ -74,9 +75,9 @@ class TwoWayTransition:
     at : TwoWay
         Attachment of the times.
     motion : Motion
-        At the times.
+        Motion at the times.
     forward, backward : Transition
-        Of the motions carried from either.
+        Values of the motions carried from either.
     """
 
     at: TwoWay
@@ -124,9 +125,9 @@ def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Att
     ends : Integrals
         Over all S segments.
     forward : Attachment
-        Of M times to the nodes before.
+        Attachment of M times to the nodes before.
     place : Attachment
-        To the nodes after, with any increments.
+        Place to the nodes after, with any increments.
     """
     whole = rows_of(ends, forward.segment)
     back = np.ascontiguousarray(whole.dR.transpose(0, 2, 1))

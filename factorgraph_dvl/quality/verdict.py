@@ -120,7 +120,7 @@ def verdict_of_result(
     converged : bool
         Whether the solver reached a minimum.
     iterations : int
-        That it took.
+        Iterations that it took.
     """
     found = [*findings, *_uncertain(findings, estimates, limits)]
     if not converged and not any(f.severity == "error" for f in found):

@@ -32,11 +32,11 @@ class Entry:
     key : str
         Name with unit, as in `instrument.yaml`.
     name, unit : str
-        As people read them.
+        Name and unit as people read them.
     rule : str
         What a positive number means.
     value, std : float
-        In `unit`.
+        Value and standard deviation in `unit`.
     grade : Grade
         Red and grey values must not be entered.
     """
@@ -126,7 +126,7 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequ
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str
-        As a certificate names it; there are no rows for a maker that is not known.
+        Maker as a certificate names it; there are no rows for a maker that is not known.
     """
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     angles = ("roll", "pitch", "yaw")

@@ -61,7 +61,7 @@ def places_of(
     terms : InstrumentTerms
         Calibration of the DVL.
     solution : Solution
-        With the antenna's lever arm, if it was estimated.
+        Solution with the antenna's lever arm, if it was estimated.
     settings : mapping of str to object
         Settings of the trial, by section: the antenna's lever arm, if it was not.
     """

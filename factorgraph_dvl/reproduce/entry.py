@@ -23,9 +23,9 @@ class Result:
     Parameters
     ----------
     measured : str
-        In a line, with its numbers.
+        What was measured, in a line, with its numbers.
     verdict : Verdict
-        By these numbers.
+        Verdict by these numbers.
     details : tuple of str, optional
         Lines of Markdown: tables, reasons.
     figure : Figure, optional
@@ -67,11 +67,11 @@ class Paper:
     Parameters
     ----------
     name : str
-        As the command has it.
+        Name as the command has it.
     reference : str
         Authors, title, journal, year.
     entries : tuple of Entry
-        In the order of the publication.
+        Entries in the order of the publication.
     """
 
     name: str

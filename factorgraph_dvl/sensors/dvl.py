@@ -318,7 +318,7 @@ class DvlVelocity(ObservationByRows):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        As in the file.
+        Times as in the file.
     measured_d : ndarray, shape (M, 3), m/s
         Velocity in d.
     std : ndarray, shape (M, 3), m/s

@@ -97,8 +97,8 @@ class Gnss:
     source : str, optional
         Name of the file, for messages.
     turning : TurntableMotion, optional
-        Of the body relative to the ship that carries the antenna; None = the antenna is fixed to
-        the body.
+        Rotation of the body relative to the ship that carries the antenna; None = the antenna is
+        fixed to the body.
 
     Examples
     --------

@@ -202,15 +202,15 @@ class ImuErrorStd:
     Parameters
     ----------
     gyro_scale : float
-        Of a diagonal element of Mg.
+        Standard deviation of a diagonal element of Mg.
     gyro_misalignment : float
-        Of an off-diagonal element of Mg, rad.
+        Standard deviation of an off-diagonal element of Mg, rad.
     gyro_g_sensitivity : float
-        Of an element of Gg, (rad/s)/(m/s²).
+        Standard deviation of an element of Gg, (rad/s)/(m/s²).
     accel_scale : float
-        Of a diagonal element of Ma.
+        Standard deviation of a diagonal element of Ma.
     accel_misalignment : float
-        Of an element of Ma below the diagonal, rad.
+        Standard deviation of an element of Ma below the diagonal, rad.
     """
 
     gyro_scale: float = 0.0

@@ -47,8 +47,8 @@ class Motion:
         Standard deviation of omega_eb_b from the gyro's noise and from motion that its samples do
         not resolve.
     turning_b, moving_n : ndarray, shape (M, 3), optional
-        By how much attitude and position change faster than omega_eb_b and v_n say, rad/s and m/s:
-        where two motions that differ are blended.
+        Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
+        and m/s: where two motions that differ are blended.
     """
 
     nRb: Array
@@ -69,13 +69,13 @@ class Linearization:
     Parameters
     ----------
     residual : ndarray, shape (M, d)
-        In the unit of the measurement.
+        Residual in the unit of the measurement.
     d_theta : ndarray, shape (M, d, 3), optional
-        With respect to theta in nRb Exp(theta).
+        Derivative with respect to theta in nRb Exp(theta).
     d_p, d_v : ndarray, shape (M, d, 3), optional
-        With respect to p_n and v_n.
+        Derivatives with respect to p_n and v_n.
     d_omega : ndarray, shape (M, d, 3), optional
-        With respect to omega_eb_b.
+        Derivative with respect to omega_eb_b.
     d_parameters : dict of str to ndarray, optional
         Name to (M, d, n); for a rotation, with respect to delta in R Exp(delta).
     """
@@ -175,7 +175,7 @@ class ScaleWalk:
     rate : float, 1/√s
         Standard deviation of its change.
     time : ndarray, shape (M,), s
-        Of the measurements, in order.
+        Times of the measurements, in order.
     measured : ndarray, shape (M, d)
         What was measured; a unit of scale adds what is predicted of it.
     """
@@ -370,7 +370,7 @@ class Attitudes:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the attitudes.
+        Times of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Attitude of the sensor's axes.
     sigma : ndarray, shape (M,), rad

@@ -136,7 +136,7 @@ class SpeedLog:
     speed : ndarray, shape (M,)
         Ahead, m/s; nan where not measured.
     starboard : ndarray, shape (M,)
-        To starboard, m/s; nan where not measured, which stands for none.
+        Speed to starboard, m/s; nan where not measured, which stands for none.
     source : str, optional
         Name of the file, for messages.
     """
@@ -223,11 +223,11 @@ class LogVelocity(ObservationByRows):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the measurements.
+        Times of the measurements.
     measured : ndarray, shape (M, 2), m/s
         Ahead and to starboard.
     std : ndarray, shape (M, 2), m/s
-        Of each.
+        Standard deviation of each component.
     body_axes : BodyAxes
         Axes of the body.
     """

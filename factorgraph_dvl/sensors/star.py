@@ -104,7 +104,7 @@ class Star:
     quaternion : ndarray, shape (M, 4)
         Scalar first, of iRs: the tracker's axes to GCRS; nan where not measured.
     covariance : ndarray, shape (M, 3, 3), rad²
-        Of phi in iRs Exp(phi).
+        Covariances of phi in iRs Exp(phi).
     source : str, optional
         Name of the file, for messages.
     vectors : StarVectors, optional
@@ -355,7 +355,7 @@ class StarAttitude(PlainObservation):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the attitudes.
+        Times of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Measured.
     axes : ndarray, shape (M, 3, 3)

@@ -62,7 +62,7 @@ def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     kind : type of T
         The type; it should forbid unknown fields.
     source : str, optional

@@ -31,7 +31,7 @@ class Halves:
     Parameters
     ----------
     names : tuple of str
-        Of the n components, as in `covariance.order`.
+        Names of the n components, as in `covariance.order`.
     first, second : ndarray, shape (n,)
         What each half says, in reported units.
     first_std, second_std : ndarray, shape (n,)
@@ -134,7 +134,7 @@ def compare_halves(trial: Trial, first: Solution, second: Solution) -> Halves:
     trial : Trial
         The whole, for its priors.
     first, second : Solution
-        Of its halves.
+        Solutions of its halves.
     """
     second = same_branch(second, first)
     prior = None if trial.dvl is None else trial.dvl.prior

@@ -70,7 +70,7 @@ def check_calibration(
     trial : Trial
         Data to check with; a part of what was solved, or all of it.
     solution : Solution
-        Of all data: motion of the vehicle.
+        Solution of all data: motion of the vehicle.
     values : mapping of str to ndarray
         Calibration by name, in reported units.
     data : {'second half', 'same data'}

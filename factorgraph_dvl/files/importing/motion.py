@@ -53,7 +53,7 @@ class Navigation:
     Parameters
     ----------
     ins : Merged
-        In order.
+        INS in order.
     deviations : Merged or None
         Its standard deviations, where these have a file of their own.
     with_std : bool

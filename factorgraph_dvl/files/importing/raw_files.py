@@ -55,7 +55,7 @@ def import_files(
     Parameters
     ----------
     files : sequence of path-like
-        In any order; their names do not matter.
+        Files in any order; their names do not matter.
     out : path-like
         Trial folder to write.
     form : str, optional

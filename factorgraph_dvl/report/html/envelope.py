@@ -44,7 +44,7 @@ def envelope(time: Array, values: Array) -> Envelope:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        In order.
+        Times in order.
     values : ndarray, shape (M, d)
         Values; nan where there are none.
     """

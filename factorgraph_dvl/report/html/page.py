@@ -124,7 +124,7 @@ def comparison_page(results: Sequence[Result], *, redacted: bool = False) -> str
     Parameters
     ----------
     results : sequence of Result
-        At least two, with different names; the others are compared with the first.
+        Results; at least two, with different names; the others are compared with the first.
     redacted : bool, default False
         Leave out absolute positions, names of trials, and names of files.
     """

@@ -43,11 +43,11 @@ class Plot:
     title : str
         What is shown, as `words` lists it.
     unit : str
-        Of the values; empty if they have none.
+        Unit of the values; empty if they have none.
     names : sequence of str
         Names of the d components.
     time : ndarray, shape (M,), s
-        In order.
+        Times in order.
     values : ndarray, shape (M, d)
         Values; nan where there are none.
     segments : sequence of Segment, optional

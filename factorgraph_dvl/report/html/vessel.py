@@ -52,7 +52,7 @@ def vessel_drawing(
     terms : InstrumentTerms
         Calibration of the DVL.
     solution : Solution
-        With the antenna's lever arm, if it was estimated.
+        Solution with the antenna's lever arm, if it was estimated.
     settings : mapping of str to object
         Settings of the trial, by section.
     """
