@@ -75,7 +75,7 @@ def prepare(increments: Increments, settings: ImuSettings) -> StrapdownSamples:
 
 
 def at_times(samples: StrapdownSamples, time: Array) -> tuple[np.ndarray, Partial]:
-    """Return the intervals that hold times (M,), and the motion within them up to there."""
+    """Return the intervals that contain times (M,), and the motion within them up to there."""
     inc = samples.increments
     index, since, _ = inc.locate(time)
     return index, inc.partial(index, np.clip(since, 0.0, inc.dt[index]))

@@ -2,7 +2,7 @@
 
 The rotation that best takes one point set to the other is Wahba's problem; the scale
 follows by projection. Time-independent, without lever arm, bias or recursion: the trial's
-own lever arm is taken off beforehand.
+own lever arm is taken off in advance.
 
 Umeyama, IEEE Trans. PAMI 13(4), 1991.
 """

@@ -110,7 +110,7 @@ def write_seeds(
 
 
 def campaign_content(campaign: Campaign) -> dict[str, Any]:
-    """Return what campaign.json holds.
+    """Return what campaign.json contains.
 
     Parameters
     ----------

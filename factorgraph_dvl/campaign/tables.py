@@ -24,7 +24,7 @@ def joint_table(campaign: Campaign, joint: JointCalibration) -> Table:
     """
     table = Table(
         title="Joint calibration",
-        caption="Grade: of the next trial, whose σ includes the variation between trials.",
+        caption="Grades are those of a next trial: its σ includes the variation between trials.",
     )
     table.column("parameter")
     table.column("value ± σ", numeric=True)

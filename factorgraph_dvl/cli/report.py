@@ -95,7 +95,7 @@ def report(
 
 
 def _load(folder: Path) -> Result:
-    """Return what a solution folder holds."""
+    """Return what a solution folder contains."""
     from factorgraph_dvl.files.run_file import read_run
     from factorgraph_dvl.files.solution_folder import (
         CHECK_FILE,

@@ -127,7 +127,7 @@ def save_solution(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set; if it holds a trial.
+        If the folder exists, is not empty, and `force` is not set; if it contains a trial.
 
     Examples
     --------
@@ -225,7 +225,7 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
 def load_solution(path: Path | str) -> Solution:
     """Read a solution folder.
 
-    The files hold the diagonals of the trajectory's covariances: what is loaded has zeros
+    The files contain the diagonals of the trajectory's covariances: what is loaded has zeros
     elsewhere. Residuals are those of `residuals.parquet` and `rejected.csv`, where they exist.
 
     Parameters
@@ -236,7 +236,7 @@ def load_solution(path: Path | str) -> Solution:
     Raises
     ------
     DataError
-        If a file is missing or does not hold what it should.
+        If a file is missing or does not contain what it should.
 
     Examples
     --------
@@ -271,7 +271,7 @@ def read_history(path: Path) -> tuple[Array, tuple[str, ...], Array] | None:
     Raises
     ------
     DataError
-        If it does not hold what it should.
+        If it does not contain what it should.
     """
     file = path / HISTORY_FILE
     if not os.path.lexists(file):
@@ -288,7 +288,7 @@ def read_halves(path: Path) -> dict[str, Any]:
     Raises
     ------
     DataError
-        If it does not hold what it should.
+        If it does not contain what it should.
     """
     file = path / HALVES_FILE
     return read_table(file, read_header(file), source=str(file)) if os.path.lexists(file) else {}

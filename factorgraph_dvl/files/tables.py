@@ -38,7 +38,7 @@ def read_table(
 ) -> dict[str, Any]:
     """Read columns of numbers from a CSV or, by its suffix, a Parquet file.
 
-    Those in `TEXT` hold text.
+    Those in `TEXT` contain text.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def columns_of(
     Raises
     ------
     DataError
-        If a column is missing, holds no numbers, or differs in length from the others.
+        If a column is missing, contains no numbers, or differs in length from the others.
     """
     header = [str(name) for name in table]
     names = _choose(header, required, optional, source)

@@ -91,10 +91,10 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     Raises
     ------
     ConfigError
-        If trial.yaml is missing or holds a key that is unknown, missing, of the wrong
+        If trial.yaml is missing or contains a key that is unknown, missing, of the wrong
         type or out of range.
     DataError
-        If a table is missing or does not hold what it should.
+        If a table is missing or does not contain what it should.
 
     Examples
     --------
@@ -233,7 +233,7 @@ def save_trial(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set, or holds a trial that was
+        If the folder exists, is not empty, and `force` is not set, or contains a trial that was
         written otherwise.
 
     Examples
@@ -275,7 +275,7 @@ def _write_settings(folder: Path, settings: TrialSettings, seed: int | None) -> 
 
 
 def check_simulated(path: Path) -> None:
-    """Raise DataError if a folder holds a trial that was not written by `simulate`."""
+    """Raise DataError if a folder contains a trial that was not written by `simulate`."""
     _check_written(path, "simulate", (_SIMULATED,))
 
 

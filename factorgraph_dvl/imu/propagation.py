@@ -43,7 +43,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """Where M measurement times hang on the chain, and the increments up to them.
+    """Where M measurement times are attached to the chain, and the increments up to them.
 
     Parameters
     ----------

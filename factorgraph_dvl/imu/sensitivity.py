@@ -86,7 +86,7 @@ def sensitivities(
     errors : sequence of ImuError
         The n errors.
     attachments : sequence of Attachment
-        Where measurements hang on the chain.
+        Where measurements are attached to the chain.
 
     Returns
     -------
@@ -175,7 +175,7 @@ def carried_back_by(at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sens
     Parameters
     ----------
     at : TwoWay
-        Where M times hang on the chain.
+        Where M times are attached to the chain.
     forward : Sensitivity
         Increments of what is integrated up to the times.
     ends : Sensitivity
@@ -206,7 +206,7 @@ def corrected_two_way(
     Parameters
     ----------
     at : TwoWay
-        Where M times hang on the chain.
+        Where M times are attached to the chain.
     by, ends : Sensitivity
         Sensitivities as `forward` and `ends` of `carried_back_by`.
     seg : Segments

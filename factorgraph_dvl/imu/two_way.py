@@ -33,7 +33,7 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 @dataclass(frozen=True, eq=False)
 class TwoWay:
-    """Where M times hang on both nodes of their segments.
+    """Where M times are attached to both nodes of their segments.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class TwoWayTransition:
 def attach_two_way(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
     """Attach times (M,) to both nodes of their segments; those not covered, where nearest.
 
-    Times that something still hangs on are not attached anew.
+    Times that something is still attached to are not attached anew.
     """
     known = vars(seg).setdefault("_attached", WeakValueDictionary())
     key = time.tobytes(), earth_rate_n.tobytes()

@@ -90,7 +90,7 @@ class ClockOffset:
     jump_time : float, s
         When; nan if never.
     middle : float, s
-        Time at which the offset holds.
+        Time at which the offset is valid.
     gain : float
         Log-likelihood that it gains against an offset `around`, its noise correlated as it is.
     unexplained : float

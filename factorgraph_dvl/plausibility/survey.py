@@ -1,4 +1,4 @@
-"""What a trial holds, and what is implausible about it: errors refuse it."""
+"""What a trial contains, and what is implausible about it: errors refuse it."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Fi
 
 @dataclass(frozen=True)
 class Survey:
-    """What a trial holds.
+    """What a trial contains.
 
     Parameters
     ----------

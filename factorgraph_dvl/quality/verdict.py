@@ -29,7 +29,7 @@ def grades(std: Array, observable: np.ndarray, limit: float = np.inf) -> tuple[G
     """Return the grade of each component of a parameter.
 
     Green up to the limit, orange up to twice the limit, red above; grey where the data do not
-    determine the component, or nobody knows how well they do.
+    determine the component, or it is not known how well they do.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def verdict_of_result(
     findings : sequence of Finding
         What is known of the records and of the result.
     estimates : sequence of Estimate
-        Calibration, against whose grades it is held.
+        Calibration whose grades it is compared with.
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     converged : bool

@@ -85,7 +85,7 @@ def scenario(name: str) -> Scenario:
 
 
 def judged(printed: bool, corrected: bool = False) -> Verdict:
-    """Return the verdict on what holds as printed, with a correction, or not at all."""
+    """Return the verdict on what is right as printed, with a correction, or not at all."""
     if printed:
         return "reproduced"
     return "corrected" if corrected else "not reproducible"

@@ -147,7 +147,7 @@ class Attitude:
     def from_columns(
         cls, settings: AttitudeSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], stack(columns, COLUMNS) * DEG, source)
 
     def columns(self) -> dict[str, Array]:

@@ -144,7 +144,7 @@ class Beacons:
     def from_columns(
         cls, settings: BeaconSettings, columns: Mapping[str, Any], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(
             settings,
             columns["time_s"],

@@ -71,7 +71,7 @@ class PointPosition(_OfPoint):
     measured_n : ndarray, shape (M, 3), m
         Position in n.
     lRn : ndarray, shape (M, 3, 3)
-        N to the local-level axes in which `std` holds.
+        N to the local-level axes for which `std` is right.
     std : ndarray, shape (M, 3), m
         East, north, up.
     label : str

@@ -79,7 +79,7 @@ class Depth:
     def from_columns(
         cls, settings: DepthSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], columns["depth_m"], source)
 
     def columns(self) -> dict[str, Array]:

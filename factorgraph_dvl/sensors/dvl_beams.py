@@ -223,7 +223,7 @@ class DvlBeams:
     def from_columns(
         cls, settings: DvlBeamsSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], stack(columns, settings.more_columns), source)
 
     def columns(self) -> dict[str, Array]:

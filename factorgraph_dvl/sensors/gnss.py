@@ -165,7 +165,7 @@ class Gnss:
     def from_columns(
         cls, settings: GnssSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         geodetic = stack(columns, POSITION_COLUMNS) * GEODETIC_SI
         velocity, position_std, velocity_std = (stack(columns, group) for group in cls.optional)
         return cls(

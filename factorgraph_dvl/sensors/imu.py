@@ -355,7 +355,7 @@ class Imu:
     def from_columns(
         cls, settings: ImuSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         gyro, accel = stack(columns, COLUMNS[1:4]), stack(columns, COLUMNS[4:7])
         return cls(settings, columns["time_s"], gyro, accel, source)
 

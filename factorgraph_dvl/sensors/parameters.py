@@ -194,8 +194,8 @@ class Parameter:
     joint : JointPrior, optional
         The calibration of several parameters that mean and sigma come from.
     nominal : ndarray, shape (N, 3), optional
-        Nominal directions: unit vectors in body, which the components turn, two each. Files hold
-        the directions.
+        Nominal directions: unit vectors in body, which the components turn, two each. Files
+        contain the directions.
     """
 
     spec: ParameterSpec

@@ -125,7 +125,7 @@ class SensorClock(Protocol):
 
 @dataclass(frozen=True)
 class ExpectedCorrelation:
-    """What is known beforehand of noise that persists from one measurement to the next.
+    """What is known in advance of noise that persists from one measurement to the next.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ class Observation(Protocol):
 
     @property
     def correlated(self) -> ExpectedCorrelation | None:
-        """What is known beforehand of noise that persists; None = nothing."""
+        """What is known in advance of noise that persists; None = nothing."""
 
     @property
     def scale_walk(self) -> ScaleWalk | None:
@@ -284,7 +284,7 @@ class ObservationByRows(PlainObservation):
 
 
 class SensorSection(Section, frozen=True, kw_only=True):
-    """A sensor's section of trial.yaml, with the table that holds its record.
+    """A sensor's section of trial.yaml, with the table that contains its record.
 
     `noise` says whether the stated noise is a start value or final; unset = as the trial says.
     """
@@ -306,7 +306,7 @@ class SensorSection(Section, frozen=True, kw_only=True):
 class SensorRecord(Protocol):
     """A sensor's record, and how it stands in files.
 
-    `section` names its part of trial.yaml and its table, `section_type` holds the
+    `section` names its part of trial.yaml and its table, `section_type` contains the
     settings, `specs` lists what can be calibrated, with each number of components. Of the
     columns, `required` and the settings' `more_columns` must be there, and of each group of
     `optional` ones all or none.
@@ -324,7 +324,7 @@ class SensorRecord(Protocol):
 
     @classmethod
     def from_columns(cls, settings: Any, columns: Mapping[str, Array], source: str) -> Self:
-        """Return the record that a table holds; columns that it does not have are nan."""
+        """Return the record in a table; columns that it does not have are nan."""
 
     def columns(self) -> dict[str, Array]:
         """Return the record as a table."""

@@ -97,7 +97,7 @@ class Heading:
     def from_columns(
         cls, settings: HeadingSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], columns["heading_deg"] * DEG, source)
 
     def columns(self) -> dict[str, Array]:
@@ -163,7 +163,7 @@ class SpeedLog:
     def from_columns(
         cls, settings: LogSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(
             settings, columns["time_s"], columns["speed_m_s"], columns["starboard_m_s"], source
         )

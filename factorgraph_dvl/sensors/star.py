@@ -141,7 +141,7 @@ class Star:
     def from_columns(
         cls, settings: StarSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds: quaternions, or vectors."""
+        """Return the record in a table: quaternions, or vectors."""
         time = columns["time_s"]
         quaternion, vectors = (stack(columns, group) for group in cls.optional)
         as_vectors = not np.isnan(vectors).all()
@@ -258,7 +258,7 @@ class Star:
 
         The square is the loss of Wahba's problem over sigma² and the degrees of freedom: two
         components across each direction, less three of each attitude. nan where the record
-        holds attitudes.
+        contains attitudes.
         """
         v = self.vectors_of_epochs
         if v is None:

@@ -36,7 +36,7 @@ def read_bytes(
     limit : int
         Limit of its size, bytes.
     expected : str
-        What it should hold, for messages.
+        What it should contain, for messages.
     kind : type of ConfigError or DataError, optional
         Kind of the error.
 
@@ -75,7 +75,7 @@ def open_file(
     path : path-like
         Path of the file.
     expected : str
-        What it should hold, for messages.
+        What it should contain, for messages.
     where : str, optional
         Name of the file in messages; by default its path.
     kind : type of ConfigError or DataError, optional

@@ -100,7 +100,7 @@ class Halves:
 def halves_of(trial: Trial) -> tuple[Trial, Trial]:
     """Return a trial up to the middle of its IMU's record, and from there.
 
-    What is known of the start holds for the first half only.
+    What is known of the start is valid for the first half only.
 
     Raises
     ------

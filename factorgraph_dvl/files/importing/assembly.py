@@ -1,4 +1,4 @@
-"""A trial folder of what raw files hold: sections of trial.yaml, tables, import.log."""
+"""A trial folder of what raw files contain: sections of trial.yaml, tables, import.log."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ class Navigation:
 
     @classmethod
     def of(cls, ins: Merged, deviations: Merged | None) -> Navigation:
-        """Return the solution that records hold."""
+        """Return the solution that records contain."""
         stds = [ins.sample[name] for name in _STDS]
         has_own = all(np.isfinite(std).any() for std in stds)
         return cls(ins, None if has_own else deviations, has_own or deviations is not None)
