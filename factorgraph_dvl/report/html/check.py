@@ -41,7 +41,7 @@ def check_plots(result: Result) -> list[Plot]:
         )
         for when in ("before", "after")
     ]  # fmt: skip
-    if "track_error_after_m" in columns:
+    if np.isfinite(columns.get("track_error_after_m", np.nan)).any():
         values = np.stack(
             [columns[f"track_error_{when}_m"] for when in ("before", "after")], axis=1
         )

@@ -139,7 +139,7 @@ def _check_plots(sheet: Sheet, result: Result) -> None:
                       handlelength=0.8, columnspacing=0.8,
                       bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)  # fmt: skip
     sheet.space(0.65)
-    if "track_error_after_m" in columns:
+    if np.isfinite(columns.get("track_error_after_m", np.nan)).any():
         (ax,) = sheet.axes(1.35)
         curves = [columns[f"track_error_{when}_m"] for when in ("before", "after")]
         for values, when, colour in zip(curves, ("before", "after"), _COLOURS, strict=False):
