@@ -67,9 +67,9 @@ def read_residuals(path: Path) -> tuple[Residuals, ...]:
     if not os.path.lexists(path):
         return ()
     columns = read_table(path, _COLUMNS, [(_REASON,)], source=str(path))
-    if columns[_REASON].dtype.kind != "U":
+    if columns[_REASON].dtype.kind == "f":
         # Measurements that were used have none.
-        columns[_REASON] = np.full(columns["sensor"].size, "")
+        columns[_REASON] = np.full(columns["sensor"].size, Residuals.reason)
     _, first, group = np.unique(
         np.char.add(np.char.add(columns["sensor"], "\n"), columns[_REASON]),
         return_index=True,
