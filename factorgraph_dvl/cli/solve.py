@@ -232,10 +232,14 @@ def _checked(
 
     if trial.log is None or trial.position_sensor is None:
         return None
+
+    def half(stage: str, iteration: int, cost: float | None) -> None:
+        progress(f"first half: {stage}", iteration, cost)
+
     candidates: list[tuple[Trial, Solution, Data]] = [(trial, solution, "same data")]
     with suppress(FactorgraphDvlError):
         start, rest = halves_of(trial)
-        first = first or run_batch(start, anyway=True, progress=progress)
+        first = first or run_batch(start, anyway=True, progress=half)
         if first.verdict.grade != "do not use":
             candidates.insert(0, (rest, first, "second half"))
     for part, found, data in candidates:
