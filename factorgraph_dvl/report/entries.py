@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
 from factorgraph_dvl.quality.verdict import Grade
 from factorgraph_dvl.report.table import Mark, Table
 from factorgraph_dvl.report.tables import GRADES
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT
 
 TITLE = "Enter in your DVL"
 # Why a value must not be entered, by its grade.
@@ -115,6 +117,16 @@ def conventions(i: InstrumentTerms) -> tuple[str, str, str]:
         "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
         "Do not enter red or grey values.",
         f"Lever arm: from the {i.origin} to the DVL.",
+    )
+
+
+def sum_with_compass(findings: Iterable[Finding]) -> Finding | None:
+    """Return the finding that data determine only the sum of mount and compass, if there is one.
+
+    It comes before the values: yaw alone is as uncertain as the stated error of the heading.
+    """
+    return next(
+        (f for f in findings if f.code == Code.HEADING_ERROR and f.parameter == MISALIGNMENT), None
     )
 
 

@@ -39,6 +39,7 @@ from factorgraph_dvl.report.html.markup import (
     table,
 )
 from factorgraph_dvl.report.html.plots import Plot
+from factorgraph_dvl.report.html.steps import steps_drawing
 from factorgraph_dvl.report.html.track import track_svg
 from factorgraph_dvl.report.tables import calibration_table, posterior_table
 from factorgraph_dvl.solution import Solution
@@ -546,6 +547,7 @@ def _solver_steps(steps: Sequence[Mapping[str, Any]]) -> Iterator[Html]:
     yield folded(
         label,
         paragraph(both(text)),
+        steps_drawing([float(s["objective"]) for s in steps]),
         table([both(h) for h in header], rows, label=label, numeric=(0, 2, 3, 4)),
     )
 

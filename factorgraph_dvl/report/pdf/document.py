@@ -17,7 +17,7 @@ from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.texts import Language, component_names
 from factorgraph_dvl.report.certificate import statements
 from factorgraph_dvl.report.check import check_rows, check_texts
-from factorgraph_dvl.report.entries import TITLE, conventions, entries_table
+from factorgraph_dvl.report.entries import TITLE, conventions, entries_table, sum_with_compass
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS, envelope, log_axis, style
 from factorgraph_dvl.report.figures.vessel import draw_vessel
 from factorgraph_dvl.report.html.content import Result
@@ -84,6 +84,8 @@ def _first_page(sheet: Sheet, result: Result) -> None:
         sheet.text(sheet.said("Enter nothing: this result must not be used."))
     elif has_instrument_terms(solution):
         terms = instrument_of(solution)
+        if (found := sum_with_compass(solution.findings)) is not None:
+            sheet.text(f"{sheet.said('Mount and compass:')} {_said(found, sheet.language)}", SMALL)
         _table(sheet, entries_table(terms, result.maker))
         sheet.text(" ".join(map(sheet.said, conventions(terms))), SMALL)
         places = places_of(terms, solution, result.run.get("settings", {}))

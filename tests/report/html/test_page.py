@@ -21,6 +21,7 @@ from factorgraph_dvl.quality.texts import catalogue, chinese_cause
 from factorgraph_dvl.report.html.envelope import envelope
 from factorgraph_dvl.report.html.page import UPLOT, comparison_page, report_page
 from factorgraph_dvl.report.html.plots import Plot
+from factorgraph_dvl.report.html.steps import steps_drawing
 from factorgraph_dvl.sensors.parameters import ParameterSpec
 
 # Of the files in the package `uplot` 1.6.32 as npm serves it, whose shasum is
@@ -256,3 +257,13 @@ def test_a_dense_signal_is_a_band_and_a_slow_one_a_line() -> None:
     assert np.all(dense.high - dense.low > 1.9)
     slow = envelope(time, np.sin(2.0 * np.pi * time / 100.0)[:, None])
     np.testing.assert_array_equal(slow.low, slow.high)
+
+
+def test_the_steps_are_drawn_where_they_stand() -> None:
+    text = steps_drawing([100.0, 10.0, 1.0, 0.0]).text
+    height = [float(y) for y in re.findall(r'<circle cx="[\d.]+" cy="([\d.]+)"', text)]
+    # Each factor of ten is as high, and the last is at the bottom.
+    falls = np.diff(height)
+    assert falls[0] == pytest.approx(falls[1], abs=1.0)
+    assert height[-1] == max(height)
+    assert steps_drawing([5.0]).text.count("<circle") == 1
