@@ -13,17 +13,11 @@ from reports import build_result
 
 from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.files.solution_folder import CHECK_COLUMNS, CHECK_ERRORS
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.entries import entries_of
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.pdf import document, sheet
 from factorgraph_dvl.report.pdf.document import write_pdf
-
-ERRORS = {
-    "end_point_error_m": 0.1234, "end_point_percent": 0.011, "global_error_m": 0.2,
-    "rms_error_m": 0.05, "distance_m": 907.0,
-}  # fmt: skip
 
 
 def whole_result(reasons: int = 1) -> Result:
@@ -38,23 +32,11 @@ def whole_result(reasons: int = 1) -> Result:
         own.solution, estimates=found.estimates, covariance=found.covariance, body_axes="RFU",
         findings=tuple(findings),
     )  # fmt: skip
-    time = np.arange(0.0, 600.0, 0.2)
-    table = dict.fromkeys((*CHECK_COLUMNS, *CHECK_ERRORS), np.sin(time) ** 2 + 0.01)
-    check = {
-        "data": "second half", "positions": "GNSS",
-        "residual_rms_m_s": {
-            "axes": ["forward", "starboard", "down"], "before": [1.0, 2.0, 0.5],
-            "after": [0.01, 0.01, 0.01],
-        },
-        "dead_reckoning": ERRORS | {"uncalibrated": ERRORS},
-    }  # fmt: skip
     run = dict(own.run) | {
         "files": [{"name": f"log-{k}.csv", "sha256": "a" * 64} for k in range(60)],
         "certificate": {"vessel": "RV Test", "dvl": {"maker": "TRDI", "serial": "42"}},
     }
-    return replace(
-        own, solution=solution, run=run, check=check, check_table=table | {"time_s": time}
-    )
+    return replace(own, solution=solution, run=run)
 
 
 @pytest.fixture

@@ -547,7 +547,7 @@ def _solver_steps(steps: Sequence[Mapping[str, Any]]) -> Iterator[Html]:
     yield folded(
         label,
         paragraph(both(text)),
-        steps_drawing([float(s["objective"]) for s in steps]),
+        *([steps_drawing([float(s["objective"]) for s in steps])] if len(steps) > 1 else []),
         table([both(h) for h in header], rows, label=label, numeric=(0, 2, 3, 4)),
     )
 

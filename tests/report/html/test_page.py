@@ -72,7 +72,7 @@ def test_the_verdict_comes_first_with_what_to_do(page: str) -> None:
 
 def test_every_plot_has_a_description_and_a_table(page: str) -> None:
     plots = data_of(page)["plots"]
-    assert len(plots) == 4 + 3 + 3
+    assert len(plots) == 3 + 4 + 3 + 3
     for plot in plots:
         (canvas,) = re.findall(rf'<div [^>]*id="{plot["key"]}"[^>]*>', page)
         assert 'role="img"' in canvas
