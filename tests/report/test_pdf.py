@@ -15,9 +15,12 @@ from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.entries import entries_of
+from factorgraph_dvl.report.figures.drawing import new_figure
+from factorgraph_dvl.report.figures.vessel import draw_vessel
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.pdf import document, sheet
 from factorgraph_dvl.report.pdf.document import write_pdf
+from factorgraph_dvl.report.vessel import VIEWS, Place
 
 
 def whole_result(reasons: int = 1) -> Result:
@@ -112,3 +115,22 @@ def test_chinese_needs_a_font(tmp_path, monkeypatch):
     monkeypatch.setattr(sheet, "_CHINESE", ("No Such Font",))
     with pytest.raises(ConfigError, match="no font with Chinese"):
         write_pdf(build_result(), tmp_path / "report.pdf", "zh")
+
+
+@pytest.mark.parametrize(("yaw", "starboard_of_bow"), [(0.0, 0.0), (45.0, 1.0), (-45.0, -1.0)])
+def test_the_drawing_shows_places_to_scale_and_where_the_dvl_points(yaw, starboard_of_bow):
+    """From above, ahead is up, and a DVL turned to starboard points to the right."""
+    ax = new_figure(4.0, 4.0).add_subplot()
+    cy, sy = np.cos(np.radians(yaw)), np.sin(np.radians(yaw))
+    axes = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    covariance = np.zeros((3, 3))
+    places = [
+        Place("IMU", np.zeros(3), covariance), Place("DVL", np.array([2.0, 1.0, 3.0]), covariance),
+    ]  # fmt: skip
+    draw_vessel(ax, VIEWS["From above"], places, axes)
+    (points,) = [line for line in ax.lines if line.get_marker() == "o"]
+    np.testing.assert_allclose(np.stack(points.get_data(), axis=1), [[0.0, 0.0], [1.0, 2.0]])
+    (forward,) = [t for t in ax.texts if t.get_text() == "forward"]
+    right, up = np.array(forward.xy) - [1.0, 2.0]
+    assert up > 0.0
+    assert np.sign(round(right, 9)) == starboard_of_bow

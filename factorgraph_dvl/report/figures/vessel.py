@@ -14,7 +14,7 @@ from factorgraph_dvl.report.figures.drawing import DARK, GREY, PALE, SMALL
 from factorgraph_dvl.report.vessel import AXES, SIGMAS, Place, beams
 
 # Chosen: a vessel is drawn at least so wide, m; free space, axes and beams, as shares of that.
-_LEAST_M, _FREE, _AXIS, _BEAM = 0.5, 0.75, 0.3, 0.45
+_LEAST_M, _FREE, _AXIS, _BEAM = 0.5, 0.9, 0.3, 0.45
 _COLOURS = ("#b34700", "#00694b", "#332288")
 
 
@@ -65,16 +65,12 @@ def draw_vessel(
             continue
         end = at + _AXIS * span * seen
         ax.annotate("", end, at, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.3})
-        beyond = at + 1.25 * _AXIS * span * seen
-        ax.text(
-            float(beyond[0]),
-            float(beyond[1]),
-            said(name),
-            color=colour,
-            fontsize=SMALL,
-            ha="center",
-            va="center",
-        )
+        side = seen[0] / np.hypot(*seen)
+        ax.annotate(
+            said(name), end, (6.0 * side, 6.0 * seen[1] / np.hypot(*seen)),
+            textcoords="offset points", color=colour, fontsize=SMALL, va="center",
+            ha="left" if side > 0.5 else "right" if side < -0.5 else "center",
+        )  # fmt: skip
     for place, xy in zip(places, points, strict=True):
         _draw_ellipse(ax, xy, view @ place.covariance @ view.T)
     ax.plot(*points.T, "o", color=DARK, ms=4)
