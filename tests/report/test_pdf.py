@@ -17,7 +17,7 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.entries import entries_of
 from factorgraph_dvl.report.figures.drawing import new_figure
 from factorgraph_dvl.report.figures.vessel import draw_vessel
-from factorgraph_dvl.report.html.content import Result
+from factorgraph_dvl.report.html.content import Result, redact
 from factorgraph_dvl.report.pdf import document, sheet
 from factorgraph_dvl.report.pdf.document import write_pdf
 from factorgraph_dvl.report.vessel import VIEWS, Place
@@ -92,6 +92,13 @@ def test_the_numbers_to_enter_are_those_of_the_page(tmp_path, sheets):
     third = " ".join(texts(sheets[2]))
     assert "RV Test" in third
     assert "a" * 64 in third
+
+
+def test_a_redacted_report_names_no_trial_no_file_and_no_vessel(tmp_path, sheets):
+    write_pdf(redact(whole_result()), tmp_path / "report.pdf")
+    written = " ".join(text for page in sheets for text in texts(page))
+    for hidden in ("by hand", "log-1.csv", "RV Test", "2022-10-12", "gnss.csv"):
+        assert hidden not in written
 
 
 def test_nothing_is_to_be_entered_of_a_result_that_must_not_be_used(tmp_path, sheets):

@@ -174,7 +174,7 @@ def _third_page(sheet: Sheet, result: Result) -> None:
     sheet.heading("Certificate")
     sheet.table([], [[" ".join(map(sheet.said, names)), sheet.said(text)]
                      for names, text in statements(result)])  # fmt: skip
-    if files := result.run.get("files", ()):
+    if (files := result.run.get("files", ())) and not result.redacted:
         sheet.heading("Input files", TEXT + 1.0)
         rows = [[f["name"], f["sha256"]] for f in files[:_FILES]]
         sheet.table([sheet.said("file"), "SHA-256"], rows, size=SMALL)
