@@ -105,13 +105,13 @@ def halves_of(trial: Trial) -> tuple[Trial, Trial]:
     Raises
     ------
     ConfigError
-        If the trial has no GNSS, so that nothing says where the second half starts.
+        If the trial has neither GNSS nor an INS: nothing says where the second half starts.
     """
-    if trial.gnss is None:
+    if trial.position_sensor is None:
         raise ConfigError(
             "nothing says where the second half starts",
             where="--halves",
-            expected="a trial with GNSS",
+            expected="a trial with GNSS or an INS",
         )
     record = trial.body_sensor.time
     middle = 0.5 * float(record[0] + record[-1])
