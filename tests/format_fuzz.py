@@ -1,8 +1,8 @@
 """Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
 
 COUNT inputs of at most 64 kB for each reader of this package, or for those named (with commas
-between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `nucleus`; their
-process has limits of time and memory.
+between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `tlog` and
+`nucleus`; their process has limits of time and memory.
 """
 
 from __future__ import annotations
@@ -185,6 +185,10 @@ def of_libraries():
         "ardupilot": [(".bin", lambda: logs.ardupilot_log(logs.ardupilot_trial()))],
         "ulog": [(".ulg", lambda: logs.ulog(logs.ulog_trial()))],
         "nucleus": [(".nucleus", logs.nucleus_trial)],
+        "tlog": [
+            (".tlog", lambda: logs.telemetry_trial()),
+            (".tlog", lambda: logs.telemetry_trial(gps=False)),
+        ],
     }
 
 

@@ -18,7 +18,7 @@ from factorgraph_dvl.files.formats import (
 )
 from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
-from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, ulog
+from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, telemetry, ulog
 
 FORMATS: tuple[Format, ...] = (
     *pd0.FORMATS,
@@ -36,6 +36,7 @@ FORMATS: tuple[Format, ...] = (
     nucleus.FORMAT,
     bags.FORMAT,
     ardupilot.FORMAT,
+    telemetry.FORMAT,
     ulog.FORMAT,
     TABLE,
 )

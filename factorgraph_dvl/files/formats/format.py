@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.files.formats.framing import Records
-from factorgraph_dvl.files.formats.losses import NO_LOCK, NO_TIME, NO_VALUE, Losses
+from factorgraph_dvl.files.formats.losses import NO_FIX, NO_LOCK, NO_TIME, NO_VALUE, Losses
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -244,6 +244,7 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
         valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
     elif (name := _VALUE.get(batch.kind)) is not None:
         valueless = np.isnan(records[name])
+        reason = NO_FIX if batch.kind == "fix" else NO_VALUE
     return {NO_TIME: timeless, reason: valueless & ~timeless}
 
 

@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 
 import format_fuzz as fuzz
+import format_logs as logs
 import format_writers as writers
 import numpy as np
 import pytest
+import yaml
 from running import run  # noqa: F401
 
 from factorgraph_dvl.files.formats.catalogue import FORMATS
@@ -220,6 +222,20 @@ class TestRecordings:
             name.partition("[")[0]: sum(count) for name, count in found.items() if count != (0, 0)
         } == counts
 
+    def test_telemetry(self, tmp_path):
+        library = pytest.importorskip("pymavlink.mavutil")
+        found = self.accounted(tmp_path, "ardusub_small.tlog")
+        log = library.mavlink_connection(str(RECORDINGS / "ardusub_small.tlog"))
+        counts, ours = {}, {}
+        for message in iter(log.recv_match, None):
+            counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+        log.close()
+        for name, count in found.items():
+            kind = name.partition(" ")[0]
+            ours[kind] = ours.get(kind, 0) + sum(count)
+        ours["BAD_DATA"] = ours.pop("damaged")
+        assert ours == counts
+
     def test_ulog(self, tmp_path):
         pyulog = pytest.importorskip("pyulog")
         found = self.accounted(tmp_path, "px4_small.ulg")
@@ -230,3 +246,19 @@ class TestRecordings:
             topic = name.partition("[")[0]
             ours[topic] = ours.get(topic, 0) + sum(count)
         assert ours == counts
+
+
+@pytest.mark.parametrize(("step", "used"), [(0.05, "imu"), (0.25, "attitude")])
+def test_an_imu_that_is_too_slow_gives_way_to_an_attitude(tmp_path, step, used):
+    pytest.importorskip("pymavlink")
+    data = b""
+    for i in range(20):
+        own = 100.0 + step * i
+        at = logs.START + own
+        data += logs.telemetry("RAW_IMU", at, round(own * 1e6), 1, 2, -1000, *[0] * 8)
+        data += logs.telemetry("ATTITUDE", at, round(own * 1e3), 0.1, 0.2, 0.3, 0, 0, 0)
+    (tmp_path / "a.tlog").write_bytes(data)
+    decisions = import_files([tmp_path / "a.tlog"], tmp_path / "trial")
+    sections = yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text())
+    assert {"imu", "attitude"} & set(sections) == {used}
+    assert ("do not show how" in decisions.text("")) is (used == "attitude")
