@@ -128,6 +128,9 @@ def own_files():
     rowe = (samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))
     return {
         "nmea": [text],
+        "underwater-gps": [
+            data for name, data in samples.underwater_gps(60).items() if name != "orientation"
+        ],
         "pixse": [samples.PIXSE * 40],
         "pd0": [made, *map(head, recordings)],
         "ad2cp": [own, echo],

@@ -122,3 +122,29 @@ WATER_LINKED_TABLE = (
         for i in range(40)
     )
 ).encode()
+
+
+def underwater_gps(count=40, start=1_700_000_000.0, heading=90.0):
+    """Return tables of an Underwater GPS by their names, and of the sentences it was given.
+
+    The vessel lies at 54°N 3°W; the vehicle is 10 m ahead of it and 5 m to starboard, 3 m deep.
+    """
+    out = {
+        "acoustic": "timestamp,position_valid,x,y,z,std,valid_r0\n",
+        "position": "timestamp,lat,lon,orientation,fix_quality,hdop,numsats,cog,sog\n",
+        "global": "timestamp,lat,lon,orientation,fix_quality,hdop,numsats,cog,sog\n",
+        "gga": "timestamp,utc,latitude,longitude,fix_quality,numsats,hdop,orthometric_height\n",
+        "hdt": "timestamp,heading\n",
+        "orientation": "timestamp,roll,pitch,yaw,state,progress\n",
+    }
+    for i in range(count):
+        at = start + 0.25 * i
+        clock = f"2213{20 + i // 4:02d}.{i % 4 * 25:02d}"
+        # Asked twice for each place.
+        out["acoustic"] += f"{at},{i % 8 < 6},{10 + 0.001 * (i // 2)},5.0,3.0,1.5,1\n"
+        out["position"] += f"{at},54.0,-3.0,{heading},4,0.8,24,0,0\n"
+        out["global"] += f"{at},54.00001,-3.0,-1,1,0.8,24,-1,-1\n"
+        out["gga"] += f"{at},{clock},54.0,-3.0,4,24,0.8,1.4\n"
+        out["hdt"] += f"{at},{heading}\n"
+        out["orientation"] += f"{at},1.0,358.0,12.0,0,0\n"
+    return {name: text.encode() for name, text in out.items()}

@@ -13,6 +13,7 @@ from factorgraph_dvl.files.formats import (
     rowe,
     rtklib,
     sbet,
+    underwater_gps,
     water_linked,
     water_linked_table,
 )
@@ -28,6 +29,7 @@ FORMATS: tuple[Format, ...] = (
     *dvl_sentences.FORMATS,
     *water_linked.FORMATS,
     *water_linked_table.FORMATS,
+    underwater_gps.FORMAT,
     *rowe.FORMATS,
     *rtklib.FORMATS,
     *sbet.FORMATS,

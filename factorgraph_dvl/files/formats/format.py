@@ -41,7 +41,18 @@ from factorgraph_dvl.geometry.vectors import Array
 
 Family = Literal["dvl", "ins", "gnss", "vehicle", "table"]
 Kind = Literal[
-    "dvl", "water", "fix", "course", "attitude", "ins", "ins_std", "imu", "depth", "clock"
+    "dvl",
+    "water",
+    "fix",
+    "course",
+    "attitude",
+    "ins",
+    "ins_std",
+    "imu",
+    "depth",
+    "clock",
+    "acoustic",
+    "topside",
 ]
 # `utc`: seconds since 1970. `own`: the recording clock of the file, seconds since 1970 (perhaps of
 # local time) or since its start. `day`: seconds of the UTC day. `week`: of the GPS week.
@@ -90,6 +101,8 @@ _PING = np.dtype(
 # ins_std   standard deviations of a navigation solution that has a file of its own.
 # imu       `gyro` rad/s and `accel` m/s² (specific force), in `Batch.axes`.
 # depth     `depth` m below the surface.
+# acoustic  `place` of the vehicle, forward, starboard, down of a vessel at the surface; `std`; m.
+# topside   `lat`, `lon` of that vessel and `quality` as in GGA; its true `heading`.
 # clock     `time` is UTC at `received`; `number` of the ping that it belongs to, or -1.
 KINDS: dict[Kind, np.dtype[Any]] = {
     "dvl": _PING,
@@ -118,6 +131,10 @@ KINDS: dict[Kind, np.dtype[Any]] = {
     "imu": np.dtype([*_HEAD, ("gyro", "f8", (3,)), ("accel", "f8", (3,))]),
     "depth": np.dtype([*_HEAD, ("depth", "f8")]),
     "clock": np.dtype([*_HEAD, ("number", "i8")]),
+    "acoustic": np.dtype([*_HEAD, ("place", "f8", (3,)), ("std", "f8")]),
+    "topside": np.dtype(
+        [*_HEAD, *((name, "f8") for name in ("lat", "lon", "quality", "heading"))]
+    ),
 }
 
 
@@ -240,6 +257,10 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
         valueless, reason = ~np.isfinite(records["velocity"]).all(axis=1) & ~along, NO_LOCK
     elif batch.kind == "imu":
         valueless = ~(np.isfinite(records["gyro"]) & np.isfinite(records["accel"])).all(axis=1)
+    elif batch.kind == "acoustic":
+        valueless = ~np.isfinite(records["place"]).all(axis=1)
+    elif batch.kind == "topside":
+        valueless = np.isnan(records["lat"]) & np.isnan(records["heading"])
     elif batch.kind == "attitude":
         valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
     elif (name := _VALUE.get(batch.kind)) is not None:

@@ -18,6 +18,7 @@ from factorgraph_dvl.files.formats.mapping import MappingSettings
 from factorgraph_dvl.files.formats.sentences import text_losses
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
 from factorgraph_dvl.files.importing.account import Account
+from factorgraph_dvl.files.importing.acoustic import located
 from factorgraph_dvl.files.importing.assembly import (
     SUFFIX,
     assemble,
@@ -87,9 +88,16 @@ def import_files(
             spool_folder = folder / _SPOOL
             spool_folder.mkdir()
             spool = Spool(spool_folder, decisions.add, decisions.warn)
-            for path, found in zip(files, formats, strict=True):
-                _read(Path(path), found, spool, mapping, decisions, say)
-            streams = on_utc(spool.streams(), spool, decisions)
+            useless = [
+                error
+                for path, found in zip(files, formats, strict=True)
+                if (error := _read(Path(path), found, spool, mapping, decisions, say)) is not None
+            ]
+            if len(useless) == len(files):
+                raise useless[0]
+            for error in useless:
+                decisions.warn(f"{error.where}: {error.what}")
+            streams = located(on_utc(spool.streams(), spool, decisions), spool, decisions)
             say("assemble")
             name = as_text(Path(files[0]).stem)
             assembly, epoch = assemble(streams, name, decisions)
@@ -138,7 +146,8 @@ def _read(
     mapping: MappingSettings | None,
     decisions: Decisions,
     say: Progress,
-) -> None:
+) -> DataError | None:
+    """Read a file; return the error if it holds nothing, which other files may make up for."""
     size = path.stat().st_size
     decisions.add(path.name, " and ".join(form.title for form in formats) + f", {size} bytes")
     # Text is looked through once, whatever formats stand in it.
@@ -161,16 +170,17 @@ def _read(
     account = Account(path.name, spool.tallies(path.name))
     has_records = bool(account.types)
     account.include(losses)
-    if not has_records:
-        raise DataError(
-            "contains no data that a trial can use",
-            where=path.name,
-            expected="velocities, positions, attitude, depth, or the samples of an IMU",
-            hint="; ".join(account.lines()[:_SHOWN]),
-        )
     decisions.accounts.append(account)
     for text in account.warnings():
         decisions.warn(text)
+    if has_records:
+        return None
+    return DataError(
+        "contains no data that a trial can use",
+        where=path.name,
+        expected="velocities, positions, attitude, depth, or the samples of an IMU",
+        hint="; ".join(account.lines()[:_SHOWN]),
+    )
 
 
 def _override(settings: dict[str, Any], stated: Mapping[str, Any]) -> None:

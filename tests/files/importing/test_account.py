@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
 import json
 import re
 from functools import partial
@@ -235,6 +237,33 @@ class TestRecordings:
             ours[kind] = ours.get(kind, 0) + sum(count)
         ours["BAD_DATA"] = ours.pop("damaged")
         assert ours == counts
+
+    def test_underwater_gps(self, tmp_path):
+        """Counts by the module csv."""
+        parts = ("g2_acoustic", "g2_position", "g2_orientation", "nmea_GGA", "nmea_HDT")
+        files, tables = [], []
+        for part in parts:
+            packed = RECORDINGS / f"ugps_g2_{part}.csv.gz"
+            if not packed.is_file():
+                pytest.skip(f"no recording {packed.name}")
+            files.append(tmp_path / f"{part}.csv")
+            files[-1].write_bytes(gzip.decompress(packed.read_bytes()))
+            tables.append(list(csv.DictReader(files[-1].read_text().splitlines())))
+        decisions = import_files(files, tmp_path / "trial")
+        found = [
+            {kind: (read, skipped) for kind, read, skipped, _ in account.rows()}
+            for account in decisions.accounts
+        ]
+        contents = [[v for k, v in row.items() if k != "timestamp"] for row in tables[0]]
+        new = [i for i, row in enumerate(contents) if not i or row != contents[i - 1]]
+        valid = [i for i in new if tables[0][i]["position_valid"] == "True"]
+        assert found[0]["locator (acoustic)"] == (len(valid), len(new) - len(valid))
+        assert found[0]["row"] == (0, len(contents) - len(new))
+        assert found[1] == {"position (topside)": (len(tables[1]), 0)}
+        assert found[2] == {"orientation of the housing": (0, len(tables[2]))}
+        assert found[3]["GGA (topside)"] == found[3]["GGA (clock)"] == (len(tables[3]), 0)
+        assert found[4] == {"HDT (topside)": (len(tables[4]), 0)}
+        assert 1700 < len(valid) < 1800
 
     def test_ulog(self, tmp_path):
         pyulog = pytest.importorskip("pyulog")

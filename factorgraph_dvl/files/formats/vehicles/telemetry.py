@@ -27,7 +27,7 @@ from factorgraph_dvl.files.formats.format import (
     type_name,
 )
 from factorgraph_dvl.files.formats.framing import BLOCK, Source, map_file
-from factorgraph_dvl.files.formats.losses import NO_TIME, UNKNOWN_TYPE, Losses
+from factorgraph_dvl.files.formats.losses import NO_TIME, REPEATED, UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
     FIRST_WEEK,
     Row,
@@ -70,7 +70,7 @@ _UNKNOWN_16 = 65535.0
 # Of the air at sea level, and of a metre of water to 1 %, hPa.
 _AIR, _METRE = 1013.25, 100.0
 _GPS_INPUT, _GPS_RAW = "GPS_INPUT", "GPS_RAW_INT"
-_REPEATED = "GPS_RAW_INT was left out: the autopilot repeats in it what GPS_INPUT told it"
+_REPEATED = "GPS_RAW_INT was left out: it repeats GPS_INPUT"
 _ESTIMATE = (
     "GLOBAL_POSITION_INT: the filter of the autopilot, which may rest on the DVL; used if there "
     "are no other positions"
@@ -148,8 +148,9 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     for frame in _frames(source, seeds, losses):
         own = clocks.of(frame)
         name = names.get(frame.kind, f"message {frame.kind}")
-        if name not in _CONVERTERS or (repeats and name == _GPS_RAW):
-            losses.skip(name, UNKNOWN_TYPE)
+        is_repeat = repeats and name == _GPS_RAW
+        if name not in _CONVERTERS or is_repeat:
+            losses.skip(name, REPEATED if is_repeat else UNKNOWN_TYPE)
             continue
         try:
             row: Row = decoder.decode(bytearray(source[frame.at + _STAMP : frame.stop])).to_dict()
