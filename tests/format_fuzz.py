@@ -136,6 +136,7 @@ def own_files():
         "ad2cp": [own, echo],
         "pd4": [pd4s],
         "pd6": [samples.PD13.encode() * 40],
+        "pd6-table": [samples.stamped_lines(100)],
         "nortek": [nortek],
         "cerulean": [cerulean],
         "water-linked": [

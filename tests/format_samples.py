@@ -148,3 +148,23 @@ def underwater_gps(count=40, start=1_700_000_000.0, heading=90.0):
         out["hdt"] += f"{at},{heading}\n"
         out["orientation"] += f"{at},1.0,358.0,12.0,0,0\n"
     return {name: text.encode() for name, text in out.items()}
+
+
+def stamped_lines(count=40, start=300.0):
+    """Return lines of PD6 as a logger stamps them: 57 of 60 whole, as on a bad cable."""
+    out = "Timestamp(s),SensorID,RawLine,CmdOrNote\n"
+    out += f'{start},DVL,":CS,",CMD\n{start},DVL,"nonsense, of no type",\n'
+    for i in range(count):
+        at = start + 0.1 * i
+        lines = [
+            f":SA,{1.5:+6.2f},{-2.25:+6.2f},{181.0 + i:6.2f}",
+            ":TS,00010100000194,35.0,+25.0,   0.0,1500.0,003",
+            f":WI,{120:+6d},{-i:+6d},{3:+6d},{0:+6d},A",
+            f":BI,{100 + i:+6d},{-20:+6d},{3:+6d},{1:+6d},{'V' if i == 5 else 'A'}",
+            f":BD,{0.0:+12.2f},{0.0:+12.2f},{0.0:+12.2f},{5.84:+7.2f},{0.09:6.2f}",
+        ]
+        if i % 20 == 7:
+            # A digit is lost: of 107 mm/s, 17 are left.
+            lines[3] = lines[3].replace("0", "", 1)
+        out += "".join(f'{at + 0.002 * k:.6f},DVL,"{line}",\n' for k, line in enumerate(lines))
+    return out.encode()

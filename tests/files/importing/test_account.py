@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import re
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
@@ -264,6 +265,29 @@ class TestRecordings:
         assert found[3]["GGA (topside)"] == found[3]["GGA (clock)"] == (len(tables[3]), 0)
         assert found[4] == {"HDT (topside)": (len(tables[4]), 0)}
         assert 1700 < len(valid) < 1800
+
+    def test_pd6_table(self, tmp_path):
+        """Counts by the module csv."""
+        packed = RECORDINGS / "h1000_pd6_pool.csv.gz"
+        if not packed.is_file():
+            pytest.skip(f"no recording {packed.name}")
+        path = tmp_path / "a.csv"
+        path.write_bytes(gzip.decompress(packed.read_bytes()))
+        decisions = import_files([path], tmp_path / "trial")
+        found = {kind: (read, skipped) for kind, read, skipped, _ in decisions.accounts[0].rows()}
+        text = path.read_text().rstrip("\0").splitlines()
+        lines = [row["RawLine"] for row in csv.DictReader(text)]
+        counts = {}
+        for line in lines:
+            counts.setdefault(line[:4], Counter())[len(line)] += 1
+        whole = {kind: lengths.most_common(1)[0][1] for kind, lengths in counts.items()}
+        for kind in (":TS", ":BI", ":BS", ":BE", ":BD"):
+            assert sum(found[kind]) == whole[kind + ","]
+        assert sum(found["dvl"]) == whole[":SA,"] == 6183
+        typed = sum(sum(c.values()) for k, c in counts.items() if re.fullmatch(":[A-Z]{2},", k))
+        cut = typed - sum(n for kind, n in whole.items() if re.fullmatch(":[A-Z]{2},", kind))
+        # The rest of the file is zeros.
+        assert found["damaged"] == (0, len(lines) - typed + cut + 1)
 
     def test_ulog(self, tmp_path):
         pyulog = pytest.importorskip("pyulog")
