@@ -134,6 +134,7 @@ def own_files():
         "pixse": [samples.PIXSE * 40],
         "pd0": [made, *map(head, recordings)],
         "ad2cp": [own, echo],
+        "winriver": [samples.winriver_settings(*((f"a{i}.PD0", i) for i in range(30)))],
         "pd4": [pd4s],
         "pd6": [samples.PD13.encode() * 40],
         "pd6-table": [samples.stamped_lines(100)],

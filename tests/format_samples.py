@@ -168,3 +168,21 @@ def stamped_lines(count=40, start=300.0):
             lines[3] = lines[3].replace("0", "", 1)
         out += "".join(f'{at + 0.002 * k:.6f},DVL,"{line}",\n' for k, line in enumerate(lines))
     return out.encode()
+
+
+def winriver_settings(*files):
+    """Return a measurement file with a transect for each (name, variation)."""
+    out = '<?xml version="1.0" encoding="utf-8"?>\n<WinRiver><Project Name="a" Version="2.18">'
+    out += "<Site_Information/><Site_Discharge>"
+    for name, variation in files:
+        out += f'<Transect Checked="1"><File PathName="C:\\x" TransectNmb="0">{name}</File>'
+        # What was set in the field, and what is in force.
+        for checked, value in ((0, 99.0), (1, variation)):
+            out += (
+                f'<Configuration Checked="{checked}"><Offsets><Magnetic_Variation Status="2">'
+                f"{value}</Magnetic_Variation><ADCP_Transducer_Depth>0.25</ADCP_Transducer_Depth>"
+                "</Offsets><Ext_Heading><Offset>1.5</Offset></Ext_Heading><GPS><Time_Delay>0"
+                "</Time_Delay></GPS></Configuration>"
+            )
+        out += "</Transect>"
+    return (out + "</Site_Discharge></Project></WinRiver>\n").encode()

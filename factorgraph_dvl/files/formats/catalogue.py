@@ -17,6 +17,7 @@ from factorgraph_dvl.files.formats import (
     underwater_gps,
     water_linked,
     water_linked_table,
+    winriver,
 )
 from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
@@ -24,6 +25,7 @@ from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, tel
 
 FORMATS: tuple[Format, ...] = (
     *pd0.FORMATS,
+    winriver.FORMAT,
     *ad2cp.FORMATS,
     *pd4.FORMATS,
     *pd6.FORMATS,

@@ -53,6 +53,7 @@ Kind = Literal[
     "clock",
     "acoustic",
     "topside",
+    "settings",
 ]
 # `utc`: seconds since 1970. `own`: the recording clock of the file, seconds since 1970 (perhaps of
 # local time) or since its start. `day`: seconds of the UTC day. `week`: of the GPS week.
@@ -103,6 +104,9 @@ _PING = np.dtype(
 # depth     `depth` m below the surface.
 # acoustic  `place` of the vehicle, forward, starboard, down of a vessel at the surface; `std`; m.
 # topside   `lat`, `lon` of that vessel and `quality` as in GGA; its true `heading`.
+# settings  what was set for the file that `Batch.stream` names, without a time: magnetic
+#           `declination`; `transducer_depth` m; `heading_offset` of an external compass; `delay`
+#           of GNSS, s.
 # clock     `time` is UTC at `received`; `number` of the ping that it belongs to, or -1.
 KINDS: dict[Kind, np.dtype[Any]] = {
     "dvl": _PING,
@@ -134,6 +138,13 @@ KINDS: dict[Kind, np.dtype[Any]] = {
     "acoustic": np.dtype([*_HEAD, ("place", "f8", (3,)), ("std", "f8")]),
     "topside": np.dtype(
         [*_HEAD, *((name, "f8") for name in ("lat", "lon", "quality", "heading"))]
+    ),
+    "settings": np.dtype(
+        [
+            *_HEAD,
+            *((name, "f8") for name in ("declination", "transducer_depth")),
+            *((name, "f8") for name in ("heading_offset", "delay")),
+        ]
     ),
 }
 
@@ -251,6 +262,8 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
     """Return which records (N,) of a batch cannot be used, by the reason, each for one reason."""
     records = batch.records
     timeless = np.isnan(records["time"]) & np.isnan(records["received"])
+    if batch.kind == "settings":
+        timeless[:] = False
     valueless, reason = np.zeros(len(records), bool), NO_VALUE
     if batch.kind in ("dvl", "water"):
         along = np.isfinite(records["beams"]).any(axis=1) & (records["axes"] == 0)
