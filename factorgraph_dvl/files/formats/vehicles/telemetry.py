@@ -339,20 +339,20 @@ def _input(stream: str, rows: list[Row]) -> Iterator[Batch]:
     """Convert `GPS_INPUT`, as which acoustic positions reach an autopilot."""
     flags = column(rows, "ignore_flags").astype(int)
 
-    def told(values: Any, *bits: int) -> Any:
+    def stated(values: Any, *bits: int) -> Any:
         ignored = np.stack([flags & bit > 0 for bit in bits], axis=-1)
         return np.where(ignored, np.nan, values)
 
     out = started(empty("fix", len(rows)), **_time(rows))
     quality = gga_quality(column(rows, "fix_type"))
     locate(out, column(rows, "lat") * 1e-7, column(rows, "lon") * 1e-7, quality)
-    out["altitude"] = told(columns(rows, "alt"), _NO_ALTITUDE)[:, 0]
+    out["altitude"] = stated(columns(rows, "alt"), _NO_ALTITUDE)[:, 0]
     velocity = columns(rows, "ve", "vn", "vd") * (1.0, 1.0, -1.0)
-    out["velocity"] = told(velocity, _NO_SPEED, _NO_SPEED, _NO_CLIMB)
-    speed_std = told(columns(rows, "speed_accuracy"), _NO_SPEED_STD)
+    out["velocity"] = stated(velocity, _NO_SPEED, _NO_SPEED, _NO_CLIMB)
+    speed_std = stated(columns(rows, "speed_accuracy"), _NO_SPEED_STD)
     out["velocity_std"] = positive(speed_std)
     stds = columns(rows, "horiz_accuracy", "horiz_accuracy", "vert_accuracy")
-    out["std"] = positive(told(stds, _NO_STD, _NO_STD, _NO_VERTICAL_STD))
+    out["std"] = positive(stated(stds, _NO_STD, _NO_STD, _NO_VERTICAL_STD))
     week = column(rows, "time_week")
     dated = week >= FIRST_WEEK
     own, utc = out[~dated], out[dated]
