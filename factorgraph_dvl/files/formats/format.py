@@ -225,6 +225,7 @@ class Format:
         sample is empty.
     read : callable
         Given the path and a mapping (plain content of the YAML, None without), yields batches.
+        Raises ConfigError if `module` is not installed, and DataError if nothing can be read.
     verified : str
         What the reader was compared with; `not verified` where nothing could be had.
     endings : tuple of str, optional

@@ -289,6 +289,32 @@ class TestRecordings:
         # The rest of the file is zeros.
         assert found["damaged"] == (0, len(lines) - typed + cut + 1)
 
+    @pytest.mark.parametrize(
+        ("name", "lacks"),
+        [
+            ("nucleus_at_rest.nucleus", ["positions", "velocities: 266 pings, and none"]),
+            ("water_linked_a50.json", ["positions", "velocities: 232 pings", "attitude"]),
+            ("h1000_pd6_pool.csv.gz", ["positions"]),
+            ("ardusub_small.BIN", ["positions", "velocities: 0 pings"]),
+            ("ardusub_small.tlog", ["velocities: 0 pings"]),
+            ("px4_small.ulg", ["velocities: 0 pings"]),
+            ("rowe_boat_turns.ens", []),
+        ],
+    )
+    def test_what_is_missing_for_a_calibration_is_said(self, tmp_path, name, lacks):
+        path = RECORDINGS / name
+        if not path.is_file():
+            pytest.skip(f"no recording {name}")
+        if path.suffix == ".gz":
+            packed, path = path, tmp_path / path.stem
+            path.write_bytes(gzip.decompress(packed.read_bytes()))
+        for form in FORMATS:
+            if form.module and path.suffix.lower() in form.endings:
+                pytest.importorskip(form.module.partition(".")[0])
+        missing = import_files([path], tmp_path / "trial").missing
+        assert len(missing) == len(lacks)
+        assert all(text.startswith(start) for text, start in zip(missing, lacks, strict=True))
+
     def test_ulog(self, tmp_path):
         pyulog = pytest.importorskip("pyulog")
         found = self.accounted(tmp_path, "px4_small.ulg")

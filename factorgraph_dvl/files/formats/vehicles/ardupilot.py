@@ -64,23 +64,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read the messages IMU, GPS with GPA, ATT and VISO; others are passed over.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If pymavlink is not installed.
-    DataError
-        If the file cannot be read at all.
+    Parameters, result and errors are those of `Format.read`.
     """
     library = load("pymavlink.DFReader", "ardupilot")
     source = map_file(path)

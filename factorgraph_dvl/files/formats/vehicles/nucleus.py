@@ -63,23 +63,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read IMU, AHRS, bottom track and water track packets.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If nucleus-driver is not installed.
-    DataError
-        If the file cannot be read.
+    Parameters, result and errors are those of `Format.read`.
     """
     # The parser alone: the driver around it opens sockets.
     parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())

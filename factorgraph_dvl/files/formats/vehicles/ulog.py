@@ -50,23 +50,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read the messages in `CONVERTERS`; others are passed over.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If pyulog is not installed.
-    DataError
-        If the file cannot be read.
+    Parameters, result and errors are those of `Format.read`.
     """
     library = load("pyulog", "px4")
     expected = "a ULog file of PX4"
