@@ -45,14 +45,21 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """Read a file; the parameters and the result are those of `Format.read`."""
     content = _NO_XML.sub(b"", map_file(path)[:])
     losses = Losses()
+    for transect in _transects(content, losses):
+        yield from _transect(transect)
+    yield left_out(losses)
+
+
+def _transects(content: bytes, losses: Losses) -> Iterator[ElementTree.Element]:
+    """Yield the transects before damage."""
     try:
         for _, element in ElementTree.iterparse(BytesIO(content), events=("end",)):
             if element.tag == "Transect":
-                yield from _transect(element)
+                yield element
                 element.clear()
-    except ElementTree.ParseError:
+    except (ElementTree.ParseError, LookupError, ValueError):
+        # The others are for an encoding that does not exist.
         losses.add("file that is cut or no XML", 0)
-    yield left_out(losses)
 
 
 def _transect(transect: ElementTree.Element) -> Iterator[Batch]:

@@ -27,6 +27,7 @@ from factorgraph_dvl.files.importing.assembly import (
     yaml_text,
 )
 from factorgraph_dvl.files.importing.decisions import LOG_FILE, Decisions, digest_in
+from factorgraph_dvl.files.importing.packed import unpacked
 from factorgraph_dvl.files.importing.recognition import by_name, check_installed, recognise
 from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.importing.time_base import on_utc
@@ -56,7 +57,7 @@ def import_files(
     Parameters
     ----------
     files : sequence of path-like
-        In any order; their names do not matter.
+        In any order; their names do not matter. Those that end in `.gz` are unpacked.
     out : path-like
         Trial folder to write.
     form : str, optional
@@ -82,16 +83,19 @@ def import_files(
     decisions = Decisions()
     say = progress or (lambda text: None)
     kept = edited_settings(out)
-    with claim(out, force=force, owned=OWNED, inputs=files):
-        formats = [_formats_of(Path(path), form, mapping) for path in files]
+    with (
+        claim(out, force=force, owned=OWNED, inputs=files),
+        unpacked([Path(path) for path in files], decisions) as paths,
+    ):
+        formats = [_formats_of(path, form, mapping) for path in paths]
         with new_folder(out, force=force, owned=OWNED) as folder:
             spool_folder = folder / _SPOOL
             spool_folder.mkdir()
             spool = Spool(spool_folder, decisions.add, decisions.warn)
             useless = [
                 error
-                for path, found in zip(files, formats, strict=True)
-                if (error := _read(Path(path), found, spool, mapping, decisions, say)) is not None
+                for path, found in zip(paths, formats, strict=True)
+                if (error := _read(path, found, spool, mapping, decisions, say)) is not None
             ]
             if len(useless) == len(files):
                 raise useless[0]
@@ -99,7 +103,7 @@ def import_files(
                 decisions.warn(f"{error.where}: {error.what}")
             streams = located(on_utc(spool.streams(), spool, decisions), spool, decisions)
             say("assemble")
-            name = as_text(Path(files[0]).stem)
+            name = as_text(paths[0].stem)
             assembly, epoch = assemble(streams, name, decisions)
             _override(assembly.settings, {} if mapping is None else mapping.trial)
             write_tables(assembly, epoch, folder)

@@ -128,7 +128,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     names = {kind: message.msgname for kind, message in types.items()}
     clocks, repeats = _clocks(source, seeds, names)
     gathered: dict[str, list[Row]] = {}
-    losses = Losses()
+    losses, waiting = Losses(), 0
     for frame in _frames(source, seeds, losses):
         own = clocks.of(frame)
         name = names.get(frame.kind, f"message {frame.kind}")
@@ -142,17 +142,19 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
             losses.add("message that cannot be decoded", frame.at)
             continue
         row |= {"at": frame.at, "received": frame.stamp, "stamp": own}
-        stream = f"{name} {frame.sender[0]}:{frame.sender[1]}"
-        rows = gathered.setdefault(stream, [])
-        rows.append(row)
-        if len(rows) >= BLOCK:
-            yield from silently(_CONVERTERS[name](stream, rows))
-            gathered[stream] = []
-    for stream, rows in gathered.items():
-        if rows:
-            yield from silently(_CONVERTERS[stream.partition(" ")[0]](stream, rows))
+        gathered.setdefault(f"{name} {frame.sender[0]}:{frame.sender[1]}", []).append(row)
+        waiting += 1
+        if waiting >= BLOCK:
+            yield from _converted(gathered)
+            gathered, waiting = {}, 0
+    yield from _converted(gathered)
     notes = (_REPEATED,) if repeats else ()
     yield replace(left_out(losses), notes=notes)
+
+
+def _converted(gathered: Mapping[str, list[Row]]) -> Iterator[Batch]:
+    for stream, rows in gathered.items():
+        yield from silently(_CONVERTERS[stream.partition(" ")[0]](stream, rows))
 
 
 def _frames(source: Source, seeds: Mapping[int, int], losses: Losses) -> Iterator[Frame]:
