@@ -221,8 +221,8 @@ def _is_whole(source: Source, frame: Frame, seed: int) -> bool:
     stop = first + _HEADS[source[first]] + len(frame.content)
     # CRC-16/MCRF4XX is that of `binascii` with the bits of all bytes, and its own, reversed.
     summed = bytes(source[first + 1 : stop]) + bytes([seed])
-    found = int(f"{crc_hqx(summed.translate(_REVERSED), 0xFFFF):016b}"[::-1], 2)
-    return found == int.from_bytes(source[stop : stop + _CHECKSUM], "little")
+    found = crc_hqx(summed.translate(_REVERSED), 0xFFFF).to_bytes(2, "big")
+    return found.translate(_REVERSED) == source[stop : stop + _CHECKSUM]
 
 
 class _Clocks:
