@@ -101,6 +101,7 @@ def import_files(
                 raise useless[0]
             for error in useless:
                 decisions.warn(f"{error.where}: {error.what}")
+            _mention_settings([Path(path) for path in files], formats, decisions)
             streams = located(on_utc(spool.streams(), spool, decisions), spool, decisions)
             say("assemble")
             name = as_text(paths[0].stem)
@@ -128,6 +129,22 @@ def edited_settings(out: Path) -> bytes | None:
     text = settings.read_bytes()
     same = digest(text) == digest_in(log.read_text(encoding="utf-8", errors="replace"))
     return None if same else text
+
+
+def _mention_settings(
+    files: Sequence[Path], formats: Sequence[tuple[Format, ...]], decisions: Decisions
+) -> None:
+    """Name files of WinRiver that lie beside a PD0 file and were not given."""
+    given = {file.resolve() for file in files}
+    folders = {
+        path.parent
+        for path, found in zip(files, formats, strict=True)
+        if any(form.name == "pd0" for form in found)
+    }
+    for folder in sorted(folders):
+        for beside in sorted(folder.glob("*.mmt")):
+            if beside.resolve() not in given:
+                decisions.add(beside.name, "lies beside and was not given: it may say more")
 
 
 def _formats_of(path: Path, form: str, mapping: MappingSettings | None) -> tuple[Format, ...]:

@@ -526,3 +526,5 @@ def test_the_variation_that_was_set_in_winriver(tmp_path, files, variation):
         assert f"the variation that was set, {variation}°" in text
         np.testing.assert_allclose((second - first + 180) % 360 - 180, float(variation))
     assert "no position" in without.text("")
+    assert "a.mmt: lies beside and was not given" in without.text("")
+    assert "lies beside" not in text
