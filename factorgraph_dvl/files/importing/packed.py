@@ -14,7 +14,7 @@ from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.settings.files import open_file
 
 _ENDING = ".gz"
-# What tells zlib that a header of gzip precedes.
+# With this many bits, zlib expects a header of gzip.
 _GZIP = 16 + zlib.MAX_WBITS
 # Bytes that are unpacked at a time. Chosen: some ms.
 _PART = 1 << 20
