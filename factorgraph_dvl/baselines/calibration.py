@@ -204,7 +204,7 @@ def _calibrate_dvl(
     else:
         navigation = navigate(trial, pings, smoothed=method != "luo-2024")
     report(method, 0, None)
-    points_at, unused = _point_sets(navigation, dvl, as_printed=method == "luo-2024")
+    points_at, unused = point_sets(navigation, dvl, as_printed=method == "luo-2024")
     points = points_at(offset)
     if method == "joyce" or method == "pollard-read":
         outcome = _by_ship(method, navigation, points, dvl, trial.body_axes)
@@ -274,7 +274,7 @@ def _by_ship(
     return outcome_of(c, sigma, misalignment, _single(parameters["scale_error"]), body_axes)
 
 
-def _point_sets(
+def point_sets(
     navigation: Navigation | RecordedNavigation, dvl: Dvl, *, as_printed: bool
 ) -> tuple[Callable[[float], Points], tuple[int, int]]:
     """Return the point sets as a function of the time offset, and how many pings fall out.

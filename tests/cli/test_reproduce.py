@@ -58,9 +58,14 @@ def test_the_page_of_all_publications_has_every_item(name):
 def test_one_table(run, tmp_path):  # noqa: F811
     result = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert result.code == 0, result.err
-    assert "table 3: steady motion has three singular values of 57" in result.out
+    # The paper argues by the change of H: with the rows less their mean, the best manoeuvre of
+    # each state is the printed one, although 4 m/s have three singular values of 57.
+    assert "2 of 6 states with rows as they are, 6 of 6 states with rows less" in result.out
+    assert result.out.splitlines()[0].endswith(": corrected")
     page = (tmp_path / "out" / "luo-2024.md").read_text(encoding="utf-8")
-    assert "| steady | 4, 4, 4, 0, 0, 0, 0 |" in page
+    assert page.count("| steady | 0 | 0 | 0 | 0 | 0 | 0 | 0 |") == 2
+    assert "three of 4 √N = 57" in page
+    assert (tmp_path / "out" / "table-3.png").stat().st_size > 1000
     assert faults(page) == []
     again = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert again.code == 2
