@@ -21,6 +21,7 @@ one. The copy of the patent breaks off within claim 6: what follows it is derive
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -32,7 +33,6 @@ from factorgraph_dvl.geometry.earth import RATE
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import turned, turned_jacobian
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.beam_geometry import groups
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: correlation time of the smoothed errors of the attitude, s.
@@ -251,7 +251,7 @@ def _by_groups(pings: BeamPings, at: Array) -> tuple[_Linear, Array]:
     turns, scale, arm = np.split(at, [2 * n, 3 * n])
     turns = turns.reshape(n, 2)
     directions, by_turn = turned(pings.nominal_b, turns), turned_jacobian(pings.nominal_b, turns)
-    found = groups(pings.nominal_b)
+    found = tuple(combinations(range(n), 3))
     shape = (len(motion.time), len(found), 3)
     predicted, variance = np.zeros(shape), np.zeros(shape)
     by_state = np.zeros((*shape, 3 + at.size))

@@ -54,11 +54,11 @@ _GEOMETRIES: dict[str, tuple[tuple[float, float, float], list[dict[str, float]]]
         (400.0, 0.0, 0.0),
         [{"straight_s": 200}, {"turn_deg_s": 0.9, "duration_s": 520}],
     ),
-    "away, turn by 90°": (
+    "outward, turn by 90°": (
         (50.0, 50.0, 45.0),
         [{"straight_s": 200}, {"turn_deg_s": -3, "duration_s": 30}, {"straight_s": 500}],
     ),
-    "away, two turns": (
+    "outward, two turns": (
         (0.0, 300.0, 0.0),
         [
             {"straight_s": 200},
@@ -69,8 +69,8 @@ _GEOMETRIES: dict[str, tuple[tuple[float, float, float], list[dict[str, float]]]
         ],
     ),
 }
-# Away from the beacon, the direction that a start at (0, 0) assumes is the true one.
-_AWAY = tuple(name for name in _GEOMETRIES if name.startswith("away"))
+# Outward from the beacon, the direction that a start at (0, 0) assumes is the true one.
+_OUTWARD = tuple(name for name in _GEOMETRIES if name.startswith("outward"))
 # Of the sweep: noise of ranges, m, and standard deviation of its start that the filter assumes, m.
 _RANGE_STD, _START_STD = (1.0, 10.0), (50.0, 500.0)
 # Of starts near the truth: their standard deviation, m, and the noise of ranges, m.
@@ -192,20 +192,21 @@ def _shown(updates: list[float]) -> str:
 def _headline(seeds: int) -> Result:
     sweeps = {name: _sweep(seeds, name) for name in _GEOMETRIES}
     rows = [[name, *(_shown(found[m]) for m in _METHODS)] for name, found in sweeps.items()]
-    away = {m: np.concatenate([sweeps[name][m] for name in _AWAY]) for m in _METHODS}
-    other = [sweeps[n][m] for n in _GEOMETRIES if n not in _AWAY for m in _METHODS]
-    two, three = (away[m] for m in _METHODS)
+    outward = {m: np.concatenate([sweeps[name][m] for name in _OUTWARD]) for m in _METHODS}
+    other = [sweeps[n][m] for n in _GEOMETRIES if n not in _OUTWARD for m in _METHODS]
+    two, three = (outward[m] for m in _METHODS)
     both = np.isfinite(two) & np.isfinite(three)
     saved = 1.0 - float(np.median(three[both]) / np.median(two[both]))
     near, savings = _near(seeds)
     best = max(savings, key=lambda key: savings[key])
     return Result(
-        f"from (0, 0), heading away from the beacon, 2OB converged in {np.isfinite(two).sum()} of "
-        f"{two.size} runs, 3OB in {np.isfinite(three).sum()}, with {100 * saved:.0f} % fewer "
-        f"updates (median {np.median(three[both]):.0f} for {np.median(two[both]):.0f}; paper: "
-        f"75 %). In other directions {np.isfinite(np.concatenate(other)).sum()} of "
-        f"{sum(map(len, other))} runs of both converged. From a start 50 m off 3OB saves at most "
-        f"{100 * savings[best]:.0f} % ({best[0]}, ranges to {best[1]:g} m)",
+        "from (0, 0), heading outward from the beacon, 2OB converged in "
+        f"{np.isfinite(two).sum()} of {two.size} runs, 3OB in {np.isfinite(three).sum()}, with "
+        f"{100 * saved:.0f} % fewer updates (median {np.median(three[both]):.0f} for "
+        f"{np.median(two[both]):.0f}; paper: 75 %). In other directions "
+        f"{np.isfinite(np.concatenate(other)).sum()} of {sum(map(len, other))} runs of both "
+        f"converged. From a start 50 m off 3OB saves at most {100 * savings[best]:.0f} % "
+        f"({best[0]}, ranges to {best[1]:g} m)",
         judged(saved > 0.6, saved > 0.0 and bool(np.isfinite(three).mean() > 0.9)),
         (
             *table(["from (0, 0)", "4SV-2OB", "4SV-3OB"], rows),
@@ -213,7 +214,7 @@ def _headline(seeds: int) -> Result:
             f"Converged: the error stays below {_CONVERGED:g} m within {_UPDATES} updates. Ranges "
             f"to 1 and 10 m, starts that the filter takes for known to 50 and 500 m, "
             f"{counted(seeds)} each. A filter that starts at the beacon sees the bearing in the "
-            "direction of the first displacement: it needs a vehicle that heads away from the "
+            "direction of the first displacement: it needs a vehicle that heads outward from the "
             "beacon. The range rate of the first update, before any displacement, is left out. "
             "Table 1 with the paper's own settings is lost in the copy.",
             "",
@@ -373,7 +374,7 @@ def _geometry(seeds: int) -> Result:
 
 
 def _figure_4(seeds: int) -> Result:
-    name = _AWAY[0]
+    name = _OUTWARD[0]
     trial = _trial(name, 0)
     start = _beacon(trial)
     figure = new_figure(9.0, 4.8)
@@ -399,7 +400,7 @@ def _figure_4(seeds: int) -> Result:
     ends = [_error(trial, _two_tracks(name, 0, m).filtered[0])[-1] for m in _METHODS]
     origin = [_from_origin(name, 0, m, 1.0, 500.0)[-1] for m in _METHODS]
     return Result(
-        f"heading away from the beacon, at the end off by {origin[0]:.0f} m (2OB) and "
+        f"heading outward from the beacon, at the end off by {origin[0]:.0f} m (2OB) and "
         f"{origin[1]:.0f} m (3OB) from (0, 0), by "
         f"{ends[0]:.0f} "
         f"and {ends[1]:.0f} m from the mirror pair",
@@ -410,7 +411,7 @@ def _figure_4(seeds: int) -> Result:
 
 
 def _figure_5(seeds: int) -> Result:
-    name = _AWAY[0]
+    name = _OUTWARD[0]
     figure = new_figure(9.0, 3.8)
     grid = new_grid(figure, 1, 2)
     medians: dict[str, list[float]] = {}
@@ -437,7 +438,7 @@ def _figure_5(seeds: int) -> Result:
 
     two, three = medians["from (0, 0)"]
     return Result(
-        f"heading away from the beacon, median updates to convergence, 2OB, 3OB: from (0, 0) "
+        f"heading outward from the beacon, median updates to convergence, 2OB, 3OB: from (0, 0) "
         f"{shown(medians['from (0, 0)'])}; from the mirror pair "
         f"{shown(medians['from the mirror pair'])} ({counted(seeds)}); paper "
         f"{_PAPER['4sv-2ob']}, {_PAPER['4sv-3ob']}",
