@@ -145,8 +145,9 @@ GTSAM's factors take samples of an IMU one by one, each as a constant rate and f
 In a sway, the axis of rotation turns within a sample. The neglected part adds up to a drift
 (coning), and a solver would take it for a bias of the gyros. This package first makes increments
 from a polynomial through neighbouring samples ([model](model.md#from-imu-samples-to-increments)).
-It then gives them to GTSAM's Galilean preintegration. This page measures the attitude over seconds against the exact one, for samples
-that are means over their interval, without noise. A navigation-grade gyro has a bias of 0.02 °/h.
+It then gives them to GTSAM's Galilean preintegration. This page measures the attitude over seconds
+against the exact one, for samples that are means over their interval, without noise. A
+navigation-grade gyro has a bias of 0.02 °/h.
 """
 
 
