@@ -82,7 +82,12 @@ def with_covariances(
     evaluation = minimum.evaluation
     covariances = posterior(problem, minimum)
     information = data_information(
-        problem, evaluation, covariances.parameters, covariances.given, at_truth=at_truth
+        problem,
+        evaluation,
+        covariances.parameters,
+        covariances.given,
+        covariances.information,
+        at_truth=at_truth,
     )
     fixed = information.undetermined_directions()
     spurious: Array | None = information.by_node
@@ -116,7 +121,9 @@ def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:
     evaluation = solved.minimum.evaluation
     square_root, _ = factorized(free, evaluation)
     covariances = posterior(free, replace(solved.minimum, square_root=square_root))
-    information = data_information(free, evaluation, covariances.parameters, covariances.given)
+    information = data_information(
+        free, evaluation, covariances.parameters, covariances.given, covariances.information
+    )
     directions = information.undetermined_directions()
     if directions.shape != solved.fixed.shape:
         return False

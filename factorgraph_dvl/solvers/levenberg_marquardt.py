@@ -18,6 +18,9 @@ CONVERGED = 1e-5
 # The same below which the next step is for QR to prove, and small if the cost falls as promised.
 # Chosen: 0.014 σ.
 _NEARLY = 1e-4
+# The same up to which a minimum is reached where no step lowers the cost: 0.05 σ, which nothing
+# that is reported shows.
+_WITHIN = 0.5 * 0.05**2
 # The same from which on the next step is from QR at once: it may be the last. Chosen: 0.14 σ.
 _NEAR = 1e-2
 # Sizes of a step that the linear model is trusted for, once it has failed: NavState
@@ -160,7 +163,7 @@ def minimise(
             and evaluation.cost - trial.cost < _POOR_GAIN * promised
         ):
             trial = _shorter(problem, evaluation, delta, promised, trial)
-        if promised > tolerance and evaluation.cost - trial.cost < _POOR_GAIN * promised:
+        if promised > _WITHIN and evaluation.cost - trial.cost < _POOR_GAIN * promised:
             bent = _bent(problem, evaluation, delta, ordering)
             trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
             gaussian = problem.linearize(evaluation)
@@ -190,6 +193,8 @@ def minimise(
             if damping <= failed:
                 # Steps that small gain nothing, and larger ones fail: so it would go on.
                 break
+        elif promised < _WITHIN and damping == 0.0 and (root is not None or not proven):
+            return Minimum(evaluation, root, True, iteration)
         elif not careful and root is None:
             # The step may have been bad for want of digits only.
             careful = True
@@ -200,7 +205,8 @@ def minimise(
                 break
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
-    return Minimum(evaluation, root, False, iteration)
+    promised = _promised(problem, evaluation, gaussian, root.solution())
+    return Minimum(evaluation, root, promised < _WITHIN, iteration)
 
 
 def _promised(

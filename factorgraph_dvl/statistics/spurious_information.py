@@ -5,6 +5,9 @@ estimated motion it seems to: the estimate has errors, and the Jacobian takes th
 changes of direction. Thousands of pings then add up to a standard deviation of
 some degrees where the data say nothing, and the estimate follows the noise (in regression:
 errors in variables). The expected share of that error in the information is computed here.
+
+States take up a part of it, as they do of any noise of measurements: almost all where a sensor is
+more precise than the motion is known without it.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from factorgraph_dvl.graph.clocks import linearized, parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.sensors.protocol import Motion, Observation, ObservationByRows, Values
+from factorgraph_dvl.statistics.rows import with_own_covariance
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Measurements that are varied at once. Chosen: some ten megabytes.
 _AT_ONCE = 20_000
@@ -27,7 +32,12 @@ _AT_ONCE = 20_000
 _CHUNK = 4096
 
 
-def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array) -> Array:
+def spurious_information(
+    problem: Problem,
+    evaluation: Evaluation,
+    nodes: Array,
+    information: SquareRootInformation | None = None,
+) -> Array:
     """Return the spurious information by node.
 
     Parameters
@@ -37,6 +47,8 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
     nodes : ndarray, shape (K, 9, 9)
         Covariances of the states, in GTSAM's tangent space, where the parameters are exact: an
         error that all states share turns the Jacobians alike, and adds nothing.
+    information : SquareRootInformation, optional
+        On all variables, which tells what these take up of it; by default nothing, an upper bound.
 
     Returns
     -------
@@ -49,6 +61,7 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
     if problem.chain.interpolates:
         # The states are integrated out there, so that no estimate follows their errors.
         return out
+    left = {} if information is None else left_of_noise(problem, evaluation, information)
     for observation, attachment, motion, weight in zip(
         problem.observations,
         evaluation.attached,
@@ -72,11 +85,27 @@ def spurious_information(problem: Problem, evaluation: Evaluation, nodes: Array)
                 evaluation.parameters,
                 names,
                 problem.clock_zero,
+                left[observation.label][own] if left else None,
             )
             np.add.at(out, (node[:, None, None], columns[:, None], columns), part)
     for a in range(0, len(out), _CHUNK):
         out[a : a + _CHUNK] = root.T @ out[a : a + _CHUNK] @ root
     return out
+
+
+def left_of_noise(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> dict[str, Array]:
+    """Return what the variables leave of noise of each measurement, (M, d, d) by observation.
+
+    Of whitened noise e of a measurement, independent of others, eᵀ (I - J P Jᵀ) e is left.
+    """
+    found: dict[str, list[Array]] = {}
+    for rows in problem.observation_rows(evaluation):
+        (covariance,) = with_own_covariance([(rows.keys, rows.matrix)], information)
+        followed = covariance @ rows.matrix.transpose(0, 2, 1)
+        found.setdefault(rows.source, []).append(np.eye(followed.shape[1]) - followed)
+    return {source: np.concatenate(parts) for source, parts in found.items()}
 
 
 def _parts(observation: Observation) -> Iterator[tuple[slice | IntArray, Observation]]:
@@ -99,6 +128,7 @@ def spurious_by(
     values: Values,
     wanted: Sequence[str],
     clock_zero: float,
+    left: Array | None = None,
 ) -> Array:
     """Return the spurious information by measurement, (M, p, p), SI.
 
@@ -118,6 +148,8 @@ def spurious_by(
         Names of the parameters, of p columns, whose information is asked for.
     clock_zero : float
         When the offsets of clocks hold, s.
+    left : ndarray, shape (M, d, d), optional
+        What the variables leave of the noise of each, by whitened components; by default all.
     """
 
     def jacobian(at: Motion) -> Array:
@@ -153,7 +185,8 @@ def spurious_by(
             change -= base
             change *= weight[:, :, None]
             for part in parts:
-                out[part] += change[part].transpose(0, 2, 1) @ change[part]
+                own = change[part]
+                out[part] += own.transpose(0, 2, 1) @ (own if left is None else left[part] @ own)
     return out
 
 

@@ -5,7 +5,7 @@ A direction whose information is mostly spurious is not observable, and stays at
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +15,7 @@ from factorgraph_dvl.graph.clocks import linearized, parameters_of
 from factorgraph_dvl.graph.priors import after_step
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.statistics.spurious_information import spurious_information
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Share of spurious information from which on a direction is not observable. Chosen: most of it.
 SPURIOUS = 0.5
@@ -85,6 +86,7 @@ def data_information(
     evaluation: Evaluation,
     parameter_covariance: Array,
     state_covariances: Array,
+    information: SquareRootInformation,
     *,
     at_truth: bool = False,
 ) -> DataInformation:
@@ -100,6 +102,8 @@ def data_information(
         In the coordinates u of a step S u, S `Problem.prior_root`.
     state_covariances : ndarray, shape (K, 9, 9)
         Covariances of the states where the parameters are exact, in GTSAM's tangent space.
+    information : SquareRootInformation
+        On all variables.
     at_truth : bool, default False
         Whether the motion there is the true one, which adds nothing spurious: return what will be
         found once it is estimated.
@@ -108,8 +112,13 @@ def data_information(
     if size == 0:
         return DataInformation(np.zeros((0, 0)), np.zeros((len(state_covariances), 0, 0)))
     data = np.linalg.inv(parameter_covariance) - np.eye(size)
-    out = DataInformation(data, spurious_information(problem, evaluation, state_covariances))
-    return replace(out, data=data + out.spurious) if at_truth else out
+    # What the variables take up takes time, and matters only where the bound without it is large.
+    for known in (None, information):
+        spurious = spurious_information(problem, evaluation, state_covariances, known)
+        out = DataInformation(data + spurious.sum(axis=0) if at_truth else data, spurious)
+        if not out.undetermined_directions().size:
+            break
+    return out
 
 
 def parameter_information(problem: Problem, evaluation: Evaluation) -> Array:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dense_rows import dense, place_of, width_of
 from exactness import worst_relative
 from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
@@ -23,25 +24,6 @@ def system(request):
     evaluation = problem.evaluate(values)
     rows = list(rows_by_source(problem, evaluation))
     return problem, evaluation, rows
-
-
-def place_of(evaluation):
-    sizes = evaluation.values.dims()
-    edges = np.cumsum([0, *(sizes[key] for key in sorted(sizes))])
-    return {key: slice(a, b) for key, a, b in zip(sorted(sizes), edges, edges[1:], strict=False)}
-
-
-def dense(rows, place):
-    out = np.zeros((*rows.vector.shape, width_of(place)))
-    edges = np.cumsum([0, *rows.sizes])
-    for i, keys in enumerate(rows.keys):
-        for j, key in enumerate(keys.tolist()):
-            out[i, :, place[key]] += rows.matrix[i, :, edges[j] : edges[j + 1]]
-    return out
-
-
-def width_of(place):
-    return max(where.stop for where in place.values())
 
 
 def test_rows_are_those_of_the_graph(system):
