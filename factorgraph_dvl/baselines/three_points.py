@@ -64,8 +64,11 @@ def three_points(
     frame = LocalFrame(*motion.geodetic[0])
     moved = frame.position(*motion.geodetic.T) + rotate(motion.nRb, lever_arm[None])
     truth = np.diff(moved[list(rows)], axis=0)
+    # The legs have the middle point in common.
     variance = motion.covariance[list(rows), :3, :3].diagonal(axis1=1, axis2=2)
-    sigma = np.sqrt(variance[1:] + variance[:-1]).ravel()
+    differences = np.kron(np.diff(np.eye(3), axis=0), np.eye(3))
+    of_legs = differences @ np.diag(variance.ravel()) @ differences.T
+    whitening = np.linalg.inv(np.linalg.cholesky(of_legs))
 
     bow = frd_from_body(body_axes)[0]
     across = np.linalg.svd(bow[None])[2][1:]
@@ -79,9 +82,9 @@ def three_points(
         # Of the velocities, and of the axes about which they turn.
         path, *turned = (_path(motion, v, rows) for v in (b, *skew(b).transpose(2, 0, 1)))
         J = np.column_stack([p.ravel() for p in turned] + [-path.ravel() / (1.0 + k)])
-        J = J @ free.T / sigma[:, None]
+        J = whitening @ J @ free.T
         information = J.T @ J + of_prior
-        left = (truth - path).ravel() / sigma
+        left = whitening @ (truth - path).ravel()
         step = np.linalg.solve(information, J.T @ left - of_prior @ moved_by)
         R, k = R @ exp_so3(step[:2] @ across), k + float(step[2])
         moved_by = moved_by + step

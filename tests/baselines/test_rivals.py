@@ -19,6 +19,7 @@ from factorgraph_dvl.baselines.kinsey_whitcomb import kinsey_whitcomb
 from factorgraph_dvl.baselines.navigation import NavigationMotion
 from factorgraph_dvl.baselines.three_points import three_points
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import rotate
 
@@ -112,3 +113,20 @@ def test_three_points_are_needed():
     few = replace(motion, time=motion.time[:2], nRb=motion.nRb[:2], geodetic=motion.geodetic[:2])
     outcome = three_points(few, v_d[:2], MISALIGNMENT, SCALE, np.zeros(3), "RFU")
     np.testing.assert_array_equal(outcome.estimated.values[0], np.eye(3))
+
+
+def test_three_points_scatter_as_their_positions_say():
+    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01, np.zeros(3))
+    motion, v_d = rows_of(motion, slice(None, None, 40)), v_d[::40]
+    frame = LocalFrame(0.6, 1.9, 0.0)
+    position = frame.position(*motion.geodetic.T)
+    rng, found = np.random.default_rng(0), []
+    for _ in range(600):
+        noisy = position + rng.normal(0.0, 0.01, position.shape)
+        moved = replace(motion, geodetic=np.stack(frame.geodetic(noisy), axis=1))
+        found.append(three_points(moved, v_d, MISALIGNMENT, SCALE, np.zeros(3), "RFU").estimated)
+    scale = np.array([e.values[1][0] for e in found])
+    turns = np.array([log_so3(found[0].values[0].T @ e.values[0]) for e in found])
+    std = np.sqrt(found[0].covariance.diagonal())
+    scatter = np.append(turns.std(axis=0)[[0, 2]], scale.std())
+    assert np.all(np.abs(scatter / std[[0, 2, 3]] - 1.0) < 0.1)
