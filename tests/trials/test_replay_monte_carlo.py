@@ -2,7 +2,8 @@
 
     pytest -m slow tests/trials/test_replay_monte_carlo.py
 
-runs 20 seeds of each scenario; FACTORGRAPH_DVL_SEEDS runs another number.
+runs 20 seeds of each scenario, a third of them of the mix; FACTORGRAPH_DVL_SEEDS runs another
+number.
 """
 
 from __future__ import annotations
@@ -116,7 +117,9 @@ def one(job):
 
 @pytest.fixture(scope="module", params=TIMES)
 def runs(request):
-    return in_two_processes(one, [(request.param, seed) for seed in range(RUNS)])
+    # A replay of the mix takes minutes.
+    count = max(RUNS // 3, 2) if request.param in RATE else RUNS
+    return in_two_processes(one, [(request.param, seed) for seed in range(count)])
 
 
 # What a replay finds of correlated noise in the first minute is not what the whole trial shows.
