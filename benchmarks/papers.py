@@ -1,6 +1,6 @@
 """Measure what five publications state: each equation, table, figure and claim.
 
-    python benchmarks/papers.py [--seeds 2] [--out DIR]
+    python benchmarks/papers.py [--seeds 4] [--out DIR]
 
 writes `papers.md` into out/benchmarks, or with `--out docs` that of the documentation. One
 publication alone, with its figures: `factorgraph-dvl reproduce PAPER --out DIR`.
@@ -29,8 +29,10 @@ INTRODUCTION = """\
 
 The tables list each numbered equation, table, figure and claim, its place in this package, and the
 measurement over {seeds}. The verdict is *reproduced* as printed, *corrected* with the argument in
-the measurement, or *not reproducible* with the reason. One command makes all items and figures of
-a publication:
+the measurement, or *not reproducible* with the reason. Where a verdict depends on how the print is
+read, the measurement names the readings. One command makes all items and figures of a publication.
+Our copies are text. They keep the quantities and units of the printed axes, but not their ranges.
+The figures here have these quantities and units, and lines at the printed values:
 
 ```sh
 factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N, or neither for all
@@ -55,7 +57,7 @@ def sample() -> list[str]:
 
 def main() -> None:
     """Run all publications and write the page."""
-    args = common.parse(common.parser(__doc__, seeds=2))
+    args = common.parse(common.parser(__doc__, seeds=4))
     lines = INTRODUCTION.format(origin=args.origin, seeds=counted(args.seeds)).splitlines()
     verdicts: dict[str, int] = {}
     for paper in PAPERS.values():

@@ -9,6 +9,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from factorgraph_dvl.baselines.beam_calibration import calibrate_beams
+from factorgraph_dvl.baselines.evolution import evolved
+from factorgraph_dvl.baselines.kinsey_whitcomb import kinsey_whitcomb
 from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, navigate
@@ -33,6 +35,7 @@ from factorgraph_dvl.baselines.summary import (
     sensor_motion,
     summarise,
 )
+from factorgraph_dvl.baselines.three_points import three_points
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
@@ -52,6 +55,9 @@ DvlMethod = Literal[
     "nine-state-ukf",
     "wahba",
     "least-squares",
+    "differential-evolution",
+    "kinsey-whitcomb",
+    "three-points",
     "joyce",
     "pollard-read",
 ]
@@ -68,9 +74,23 @@ _NEGLECTED: dict[DvlMethod, tuple[str, ...]] = {
     "nine-state-ukf": ("lever_arm", "time_offset"),
     "wahba": ("lever_arm", "dvl_bias", "time_offset"),
     "least-squares": (),
+    "differential-evolution": ("dvl_bias", "time_offset"),
+    "kinsey-whitcomb": ("scale_error", "lever_arm", "dvl_bias", "time_offset"),
+    "three-points": ("lever_arm", "dvl_bias", "time_offset"),
     "joyce": ("lever_arm", "dvl_bias", "time_offset"),
     "pollard-read": ("lever_arm", "dvl_bias", "time_offset"),
 }
+_ONE_SCALE = (
+    "point-set",
+    "luo-2024",
+    "wahba",
+    "differential-evolution",
+    "three-points",
+    "joyce",
+    "pollard-read",
+)
+# Methods that have no standard deviations of their own.
+_NO_SIGMA = ("differential-evolution", "kinsey-whitcomb")
 # Methods that a current does not mislead.
 _THROUGH_WATER = ("joyce", "pollard-read")
 # Chosen: longest gap of GNSS, s. Over a longer one the INS drifts beyond the linear error model.
@@ -121,12 +141,13 @@ def calibrate(
         with a compass, is what the DVL is compared with. Or a planar trial, with its first
         position.
     method : Method, optional
-        Method; by default `point-set`, and `4sv-3ob` for a planar trial. `point-set` (seven
-        states), `luo-2024` (the same as printed), `nine-state`, `nine-state-linear` (as printed),
-        `nine-state-ukf`, `wahba`, `least-squares`, or the fits `joyce` and `pollard-read` for
-        ships. These take beams without a DVL beside them for the velocity that they amount to.
-        `star`, or `liu-2020` as printed; `beams`, an extended Kalman filter of single beams; or,
-        for planar trials, `4sv-2ob` or `4sv-3ob`.
+        Method; by default `point-set`, and `4sv-3ob` for a planar trial.
+        `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
+        `nine-state-linear` (as printed), `nine-state-ukf`, `wahba`, `least-squares`,
+        `differential-evolution`, `kinsey-whitcomb`, `three-points` (Tang et al.), or the fits
+        `joyce` and `pollard-read` for ships. These take beams without a DVL beside them for the
+        velocity that they amount to. `star`, or `liu-2020` as printed; `beams`, an extended
+        Kalman filter of single beams; or, for planar trials, `4sv-2ob` or `4sv-3ob`.
     rate_hz : float, default 10.0
         Rate of the trajectory in the solution.
     progress : callable, optional
@@ -205,10 +226,10 @@ def _calibrate_dvl(
     else:
         navigation = navigate(trial, pings, smoothed=method != "luo-2024")
     report(method, 0, None)
-    points_at, unused = _point_sets(navigation, dvl, as_printed=method == "luo-2024")
+    points_at, unused = point_sets(navigation, dvl, as_printed=method == "luo-2024")
     points = points_at(offset)
-    if method == "joyce" or method == "pollard-read":
-        outcome = _by_ship(method, navigation, points, dvl, trial.body_axes)
+    if method in ("joyce", "pollard-read", "three-points"):
+        outcome = _by_track(method, navigation, points, dvl, trial.body_axes)
     else:
         outcome = _calibrate(method, points_at, dvl)
     report("summary", 0, None)
@@ -254,17 +275,19 @@ def _outage(trial: Trial) -> list[Finding]:
     return [Finding(Code.GNSS_OUTAGE, message("gnss_outage.long", duration=longest))]
 
 
-def _by_ship(
+def _by_track(
     method: DvlMethod,
     navigation: Navigation | RecordedNavigation,
     points: Points,
     dvl: Dvl,
     body_axes: BodyAxes,
 ) -> Outcome:
-    """Return angle and scale as fits of a ship's horizontal velocities show them."""
+    """Return angles and scale as fits show them that need the track in navigation axes."""
     parameters = {p.stem: p for p in dvl.parameters()}
     misalignment, arm = parameters["misalignment"], parameters["lever_arm"]
-    motion = navigation.at(points.time)
+    motion, scale = navigation.at(points.time), _single(parameters["scale_error"])
+    if method == "three-points":
+        return three_points(motion, points.v_d, misalignment, scale, arm.mean, body_axes)
     ship, adcp = horizontal(motion, points.v_d, misalignment, arm.mean)
     water = dvl.settings.reference == "water"
     if method == "joyce":
@@ -272,10 +295,10 @@ def _by_ship(
     else:
         heading = rph_from_rotation(motion.nRb, body_axes)[:, 2]
         c, sigma = pollard_read(points.time, heading, ship, adcp, water=water)
-    return outcome_of(c, sigma, misalignment, _single(parameters["scale_error"]), body_axes)
+    return outcome_of(c, sigma, misalignment, scale, body_axes)
 
 
-def _point_sets(
+def point_sets(
     navigation: Navigation | RecordedNavigation, dvl: Dvl, *, as_printed: bool
 ) -> tuple[Callable[[float], Points], tuple[int, int]]:
     """Return the point sets as a function of the time offset, and how many pings fall out.
@@ -324,7 +347,11 @@ def _calibrate(method: DvlMethod, points_at: Callable[[float], Points], dvl: Dvl
     if method in ("nine-state", "nine-state-linear"):
         iterated = method == "nine-state"
         return nine_state(points, misalignment, scale, bias, arm.mean, iterated=iterated)
+    if method == "kinsey-whitcomb":
+        return kinsey_whitcomb(points, misalignment, arm.mean)
     single = _single(scale)
+    if method == "differential-evolution":
+        return evolved(points, misalignment, single, arm)
     if method == "wahba":
         return wahba(points, misalignment, single, arm.mean)
     if method == "luo-2024":
@@ -354,8 +381,10 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
         for p in (parameters[stem] for stem in _NEGLECTED[method])
         if p.estimated
     ]
-    single = ("point-set", "luo-2024", "wahba", "joyce", "pollard-read")
-    if method in single and parameters["scale_error"].mean.size == 3:
+    if method in _ONE_SCALE and parameters["scale_error"].mean.size == 3:
         text = message("method_limits.one_scale", method=method)
         out.append(Finding(Code.METHOD_LIMITS, text, parameter=parameters["scale_error"].name))
+    if method in _NO_SIGMA:
+        text = message("method_limits.no_sigma", method=method)
+        out.append(Finding(Code.METHOD_LIMITS, text))
     return out

@@ -1,9 +1,11 @@
 """The extended Kalman filters of single-beacon navigation: 4SV-2OB and 4SV-3OB.
 
-Chen, Shang and Lan, Model and algorithm improvement on single beacon underwater tracking,
-Journal of Unmanned Undersea Systems 29(4), 2021. Four state variables: position relative to
-the beacon and current, east and north; heading and speed drive them. Two observations, slant
-range and depth, which give the horizontal distance; the third is the range rate.
+Chen, Shang and Lan, Model and algorithm improvement for unmanned undersea vehicle navigation
+based on single beacon, Journal of Unmanned Undersea Systems 29(4), 428-434, 2021. Four state
+variables: position relative to the beacon and current, east and north; heading and speed drive
+them. Two observations, slant range and depth, which give the horizontal distance; the third is
+the range rate, from the second update on: a start at the beacon has no direction before the first
+displacement.
 
 They model no error of sound speed, scale, heading or beacon position, and no outliers: the
 baseline to compare with.
@@ -194,7 +196,8 @@ def run_filter(trial: Trial, method: Method | str, mean: Array, std: Array) -> F
     surface = trial.required(Depth).settings.sea_surface_height_m
     height = surface - _depth_at(trial, beacons.time)
     now = dead_reckoning.start
-    times, states, covariances, velocities = [], [], [], []
+    times: list[float] = []
+    states, covariances, velocities = [], [], []
     innovations_of: dict[str, list[tuple[float, float, float]]] = {"range": [], "range rate": []}
     for i in range(beacons.time.size):
         time = float(beacons.time[i])
@@ -216,7 +219,7 @@ def run_filter(trial: Trial, method: Method | str, mean: Array, std: Array) -> F
                 x, P, place, above, beacons.range[i], settings.range_std_m
             )
             innovations_of["range"].append((time, innovation, sigma))
-        if method == "4sv-3ob" and not np.isnan(beacons.range_rate[i]):
+        if method == "4sv-3ob" and times and not np.isnan(beacons.range_rate[i]):
             rate, rate_std = beacons.range_rate[i], settings.range_rate_std_m_s
             x, P, innovation, sigma = _by_rate(x, P, place, above, u, C, rate, rate_std)
             innovations_of["range rate"].append((time, innovation, sigma))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def write_page(
     lines = [f"# {paper.reference}", "", f"Over {counted(seeds)}.", ""]
     lines += summary_lines(results)
     for entry, result in results:
-        name = label_of(entry.label).replace(", ", "-").replace(" ", "-").replace(".", "")
+        name = re.sub(r"[^a-z0-9]+", "-", entry.label).strip("-")
         if result.details or result.figure is not None:
             lines += ["", f"## {entry.label[0].upper()}{entry.label[1:]}", "", *result.details]
         if result.figure is not None:

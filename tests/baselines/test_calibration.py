@@ -42,6 +42,8 @@ def navigation():
 
 # As published they are for small angles, or know the misalignment roughly.
 SMALL_ANGLES = ("luo-2024", "nine-state-linear", "nine-state-ukf")
+# They leave the angle about the bow open, or come to it slowly; tests/baselines/test_rivals.py.
+ABOUT_THE_BOW = ("kinsey-whitcomb", "three-points")
 # Fits of research ships average over minutes; tests/baselines/test_ship_adcp.py has theirs.
 OF_SHORT_TRIALS = [m for m in DVL_METHODS if m not in ("joyce", "pollard-read")]
 
@@ -60,7 +62,9 @@ def turned(request):
     return simulate(scenario(manoeuvres=VARIED, dvl=dvl, imu={"rate_hz": 50})), request.param
 
 
-@pytest.mark.parametrize("method", [m for m in OF_SHORT_TRIALS if m not in SMALL_ANGLES])
+@pytest.mark.parametrize(
+    "method", [m for m in OF_SHORT_TRIALS if m not in (*SMALL_ANGLES, *ABOUT_THE_BOW)]
+)
 def test_without_noise_large_misalignments_are_exact(method, turned):
     trial, misalignment = turned
     knows_arm = method in ("nine-state", "wahba")

@@ -20,6 +20,12 @@ def test_a_vessel_that_heads_elsewhere_than_north_gets_a_rotated_drift():
     assert np.abs(printed.value - DRIFTS).max() > 10.0 * printed.std[0]
 
 
+def test_a_vessel_that_heads_north_gets_the_drift_of_its_gyros():
+    printed = kalman(simulate(config("star", start={"heading_deg": 0}), 0), "liu-2020")
+    found = printed.estimate("gyro_bias_deg_h")
+    assert np.all(np.abs(found.value - DRIFTS) < 4.0 * found.std)
+
+
 def test_the_printed_star_vectors_give_a_solution():
     trial = simulate(config("liu-2020-vectors"), 0)
     found = kalman(trial, "star").estimate("gyro_bias_deg_h")

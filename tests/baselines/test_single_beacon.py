@@ -9,13 +9,15 @@ import pytest
 from findings import of_code
 from planar import STRAIGHT, changed, error_of, trial
 
-from factorgraph_dvl.baselines.single_beacon import filter_planar
+from factorgraph_dvl.baselines.single_beacon import filter_planar, run_filter
 from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.trial_folder import save_trial
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import contradictions
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.trial import InitialPosition
 
 
@@ -63,6 +65,37 @@ def test_a_filter_that_went_to_a_mirror_image_has_not_converged(tmp_path, capsys
         main(["kalman", str(tmp_path / "t"), "--out", str(tmp_path / "k"), "--no-figures"])
     assert exit_info.value.code == 1
     assert "not converged" in capsys.readouterr().err
+
+
+# Heading away from the beacon, from beside it, and a turn.
+AWAY = {
+    "start": {
+        "lat_deg": 25.0 + 50.0 / 110772.0,
+        "lon_deg": 135.0 + 50.0 / 100950.0,
+        "height_m": -40,
+        "heading_deg": 45,
+        "speed_m_s": 2,
+    },
+    "manoeuvres": [
+        {"straight_s": 200},
+        {"turn_deg_s": -3, "duration_s": 30},
+        {"straight_s": 200},
+    ],
+}
+
+
+@pytest.mark.parametrize("method", ["4sv-2ob", "4sv-3ob"])
+def test_from_the_beacon_itself_a_vehicle_that_heads_away_is_found(method):
+    t = trial(3, **AWAY)
+    beacon = next(iter(t.required(Beacons).settings.positions.values()))
+    start = t.frame().position(*beacon.geodetic)[:2]
+    filtered = run_filter(t, method, start, np.full(2, 500.0))
+    reference = t.reference
+    true = t.frame().position(*interpolate(filtered.time, reference.time, reference.geodetic).T)
+    error = np.hypot(*(filtered.state[:, :2] - true[:, :2]).T)
+    assert error[-50:].max() < 20.0
+    # A range rate before any displacement would make the position known to metres.
+    assert np.sqrt(filtered.covariance[0, :2, :2].diagonal().max()) > 300.0
 
 
 def test_a_filter_whose_innovations_contradict_it_has_not_converged():

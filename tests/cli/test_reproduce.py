@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from markdown_tables import faults
 from running import run  # noqa: F401
 
 from factorgraph_dvl.reproduce import PAPERS
+from factorgraph_dvl.reproduce.luo_2024_equations import scene_of
+from factorgraph_dvl.reproduce.luo_2024_sea import _net_shares
 from factorgraph_dvl.reproduce.page import label_of
 
 # Numbered items of each publication: equations, tables, figures.
@@ -58,9 +61,14 @@ def test_the_page_of_all_publications_has_every_item(name):
 def test_one_table(run, tmp_path):  # noqa: F811
     result = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert result.code == 0, result.err
-    assert "table 3: steady motion has three singular values of 57" in result.out
+    # The paper argues by the change of H: with the rows less their mean, the best manoeuvre of
+    # each state is the printed one, although 4 m/s have three singular values of 57.
+    assert "2 of 6 states with rows as they are, 6 of 6 states with rows less" in result.out
+    assert result.out.splitlines()[0].endswith(": corrected")
     page = (tmp_path / "out" / "luo-2024.md").read_text(encoding="utf-8")
-    assert "| steady | 4, 4, 4, 0, 0, 0, 0 |" in page
+    assert page.count("| steady | 0 | 0 | 0 | 0 | 0 | 0 | 0 |") == 2
+    assert "three of 4 √N = 57" in page
+    assert (tmp_path / "out" / "table-3.png").stat().st_size > 1000
     assert faults(page) == []
     again = run("reproduce", "luo-2024", "--table", "3", "--out", tmp_path / "out", "--quiet")
     assert again.code == 2
@@ -71,6 +79,15 @@ def test_one_figure(run, tmp_path):  # noqa: F811
     result = run("reproduce", "luo-2024", "--figure", "3", "--out", tmp_path / "out", "--quiet")
     assert result.code == 0, result.err
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"luo-2024.md", "figure-3.png"}
+
+
+def test_the_track_has_the_net_displacement_that_table_7_implies():
+    at_end, at_most = _net_shares()
+    # Table 7, over the 28.9 % that α_z and δK of table 6 make of net displacement.
+    assert at_end == pytest.approx(0.0795 / 0.289, rel=0.02)
+    assert at_most == pytest.approx(0.1279 / 0.289, rel=0.02)
+    heading = np.unwrap(scene_of("luo-2024-transit", 1.0).rph[:, 2])
+    assert abs(np.degrees(heading[1390] - heading[1310])) == pytest.approx(180.0, abs=3.0)
 
 
 def test_a_figure_that_is_not_there_is_refused(run, tmp_path):  # noqa: F811

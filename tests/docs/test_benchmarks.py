@@ -17,7 +17,17 @@ ROOT = Path(__file__).resolve().parents[2]
 SHARED = ("common", "fault_rows")
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if p.stem not in SHARED)
 # Where a page of the repository is, of those with a sample that is made anew below.
-SAMPLED = ("luo_2024", "liu_2020", "stars", "beams", "beacon_2021", "sea_trial", "papers")
+SAMPLED = (
+    "luo_2024",
+    "liu_2020",
+    "stars",
+    "beams",
+    "beacon_2021",
+    "sea_trial",
+    "papers",
+    "rivals",
+    "preintegration",
+)
 
 # Chosen: relative difference of a number to the printed one, beside one unit of its last digit,
 # that the end of an iteration may make.
