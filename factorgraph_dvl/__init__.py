@@ -13,7 +13,7 @@ The DVL reports v_d = (1 + k) dRb (v_b + omega_eb_b x l) + beta, at its true tim
 Public names
 ------------
 Trials: `Trial`, `trial_from_tables`, `load_trial`, `save_trial`, `simulate`, and the records
-`Imu`, `Gnss`, `Dvl` with their settings. `survey` says what a trial holds, and what is wrong.
+`Imu`, `Gnss`, `Dvl` with their settings. `survey` says what a trial contains, and what is wrong.
 
 Estimates: `solve`, `Replay`, `kalman` (the usual filters, to compare). They return a `Solution`,
 with its `Trajectory`, each `Estimate` and a `Verdict`; `load_solution`, `save_solution`,

@@ -58,7 +58,7 @@ class ConfigError(FactorgraphDvlError):
 
 
 class DataError(FactorgraphDvlError):
-    """A data file or record does not hold what it should.
+    """A data file or record does not contain what it should.
 
     Examples
     --------
@@ -85,7 +85,7 @@ class OutputError(FactorgraphDvlError):
 
 
 def as_text(name: object) -> str:
-    r"""Return the name of a file as text that any file in UTF-8 can hold.
+    r"""Return the name of a file as text that any file in UTF-8 can contain.
 
     Where Python does not know the encoding of names, they are taken to be in UTF-8; bytes that
     are not are escaped, such as `\xff`.

@@ -26,7 +26,7 @@ class Trajectory:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the epochs.
+        Times of the epochs.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m).
     velocity : ndarray, shape (M, 3)
@@ -88,11 +88,11 @@ class Estimate:
     Parameters
     ----------
     name : str
-        As in calibration.json, e.g. `misalignment_deg`.
+        Name as in calibration.json, e.g. `misalignment_deg`.
     component_names : tuple of str
-        As in `covariance.order`.
+        Component names as in `covariance.order`.
     value, std : ndarray, shape (n,)
-        In the unit of the name.
+        Value and standard deviations in the unit of the name.
     prior_value, prior_std : ndarray, shape (n,)
         What was known before.
     observable : ndarray of bool, shape (n,)
@@ -141,11 +141,11 @@ class Residuals:
     Parameters
     ----------
     label, unit : str
-        Of the measurement.
+        Label and unit of the measurement.
     components : tuple of str
         Names of the d components.
     time : ndarray, shape (M,), s
-        Of the epochs.
+        Times of the epochs.
     residual : ndarray, shape (M, d)
         Predicted - measured; nan where a component was not measured.
     sigma : ndarray, shape (M, d)
@@ -170,9 +170,10 @@ class Noise:
     Parameters
     ----------
     name : str
-        As in calibration.json, e.g. `dvl_velocity`.
+        Name as in calibration.json, e.g. `dvl_velocity`.
     factor : ndarray, shape (d,)
-        On the stated standard deviations, by component; of white and correlated noise together.
+        Factor on the stated standard deviations, by component; of white and correlated noise
+        together.
     correlation_time : ndarray, shape (d,), s, optional
         Correlation time of what persists from one measurement to the next; nan for a component
         whose noise is white, None where all are.
@@ -289,7 +290,7 @@ def mixed(trajectories: Sequence[Trajectory], weights: Array) -> Trajectory:
     Parameters
     ----------
     trajectories : sequence of Trajectory
-        Of the same epochs.
+        Trajectories of the same epochs.
     weights : ndarray, shape (T,)
         Likelihoods.
     """

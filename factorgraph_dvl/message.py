@@ -45,7 +45,7 @@ def message(key: str, **values: object) -> Message:
     Parameters
     ----------
     key : str
-        As in `Message`.
+        Key as in `Message`.
     **values : str, float, Message, ndarray or sequence of these
         Values by the names of the template.
     """
@@ -53,12 +53,12 @@ def message(key: str, **values: object) -> Message:
 
 
 def plain(value: object) -> Value:
-    """Return a value as messages hold it.
+    """Return a value as messages contain it.
 
     Raises
     ------
     TypeError
-        If a message holds no such values.
+        If a message contains no such values.
     """
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()

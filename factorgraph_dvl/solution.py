@@ -111,7 +111,7 @@ class Solution(Judged):
     converged : bool
         Whether the solver reached a minimum.
     iterations : int
-        That it took.
+        Iterations that it took.
     cost : float
         Half the sum of squared whitened residuals, at the solution.
     estimates : tuple of Estimate
@@ -121,7 +121,7 @@ class Solution(Judged):
     trajectory : Trajectory
         The motion.
     residuals : tuple of Residuals, optional
-        Of each sensor.
+        Residuals of each sensor.
     findings : tuple of Finding, optional
         What the user must know of the records and the result.
     hypotheses : tuple of Hypothesis, optional
@@ -134,7 +134,7 @@ class Solution(Judged):
     limits : mapping of str to float, optional
         Standard deviations that are good enough, by parameter, in reported units.
     noise : tuple of Noise, optional
-        Of the measurements whose noise was estimated.
+        Noise of the measurements whose noise was estimated.
     error_budget : tuple of Cause, optional
         What makes up the standard deviations, the largest causes first.
     epoch : str, optional

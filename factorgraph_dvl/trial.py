@@ -71,7 +71,7 @@ class InitialAttitude:
     rph : ndarray, shape (3,)
         Roll, pitch, heading, rad.
     std : ndarray, shape (3,), rad
-        Of roll, pitch, heading.
+        Standard deviations of roll, pitch, heading.
     """
 
     rph: Array
@@ -87,7 +87,7 @@ class InitialVelocity:
     velocity : ndarray, shape (3,), m/s
         Local-level east, north, up, of the IMU.
     std : ndarray, shape (3,), m/s
-        Of east, north, up.
+        Standard deviations of east, north, up.
     """
 
     velocity: Array
@@ -101,7 +101,7 @@ class Reference:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the epochs.
+        Times of the epochs.
     geodetic : ndarray, shape (M, 3)
         Latitude, longitude (rad), ellipsoidal height (m) of the IMU.
     velocity : ndarray, shape (M, 3)
@@ -123,7 +123,7 @@ class Trial:
     Parameters
     ----------
     name : str
-        Of the trial.
+        Name of the trial.
     imu : Imu or None
         The IMU; None where an INS, another sensor of attitude, or a compass with a speed log
         takes its place.

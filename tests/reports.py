@@ -9,6 +9,7 @@ import numpy as np
 from builders import build_solution
 
 from factorgraph_dvl.estimates import Cause, Residuals, Trajectory
+from factorgraph_dvl.files.solution_folder import CHECK_COLUMNS, CHECK_ERRORS
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.html.content import Result
 
@@ -35,6 +36,25 @@ def residuals(seconds: float) -> Residuals:
     )
 
 
+def checked(seconds: float) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Content of check.json and columns of check.parquet."""
+    time = np.arange(0.5 * seconds, seconds, 0.2)
+    errors = {
+        "end_point_error_m": 0.1234, "end_point_percent": 0.011, "global_error_m": 0.2,
+        "rms_error_m": 0.05, "distance_m": 907.0,
+    }  # fmt: skip
+    check = {
+        "data": "second half", "positions": "GNSS",
+        "residual_rms_m_s": {
+            "axes": ["forward", "starboard", "down"], "before": [1.0, 2.0, 0.5],
+            "after": [0.01, 0.01, 0.01],
+        },
+        "dead_reckoning": errors | {"uncalibrated": errors},
+    }  # fmt: skip
+    table = dict.fromkeys((*CHECK_COLUMNS, *CHECK_ERRORS), np.sin(time) ** 2 + 0.01)
+    return check, table | {"time_s": time}
+
+
 def build_result(seconds: float = 600.0, **changes: Any) -> Result:
     own = build_solution()
     adds = np.concatenate([e.std for e in own.estimates]) / np.sqrt(2.0)
@@ -57,4 +77,5 @@ def build_result(seconds: float = 600.0, **changes: Any) -> Result:
                      "interval_s": 0.2, "longest_interval_s": 0.4}],
         "truth": {"scale_error": [0.005]},
     }  # fmt: skip
-    return replace(Result("out", solution, run), **changes)
+    check, table = checked(seconds)
+    return replace(Result("out", solution, run, check=check, check_table=table), **changes)

@@ -27,11 +27,11 @@ class BeamAngles:
     Parameters
     ----------
     alpha, theta : ndarray, shape (N,), deg
-        To the yz plane and to the xy plane, of the calibrated beams.
+        Angles to the yz plane and to the xy plane, of the calibrated beams.
     alpha_std, theta_std : ndarray, shape (N,), deg
         Their standard deviations.
     alpha_nominal, theta_nominal : ndarray, shape (N,), deg
-        Of the nominal beams.
+        Angles of the nominal beams.
     """
 
     alpha: Array

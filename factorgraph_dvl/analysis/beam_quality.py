@@ -40,7 +40,7 @@ class BeamCalibration:
     scale_error : ndarray, shape (N,)
         Scale error of each beam.
     lever_arm : ndarray, shape (3,), m
-        From the IMU to the DVL, in body.
+        Lever arm from the IMU to the DVL, in body.
     """
 
     directions_d: Array
@@ -69,7 +69,7 @@ class BeamQuality:
     groups : tuple of str
         Names of the groups of three beams, such as `123`.
     group_velocity : ndarray, shape (M, G, 3)
-        In d, m/s; nan where a beam of the group was lost.
+        Group velocity in d, m/s; nan where a beam of the group was lost.
     error_velocity : ndarray, shape (M,)
         Error velocity, m/s; nan with fewer than four beams.
     error_sigma : ndarray, shape (M,)

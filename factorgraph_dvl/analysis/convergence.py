@@ -22,7 +22,7 @@ class ComponentConvergence:
     Parameters
     ----------
     name : str
-        Of the component.
+        Name of the component.
     good_std, good_error : float
         Limits, in its unit.
     std_since : float
@@ -70,13 +70,13 @@ def convergence(
     Parameters
     ----------
     time : ndarray, shape (H,), s
-        Of the updates.
+        Times of the updates.
     values, std : ndarray, shape (H, n)
         What was known then, in the order of `estimates`.
     inconsistent : ndarray, shape (H,)
         Whether the standard deviations were not to be trusted.
     estimates : sequence of Estimate
-        At the end.
+        Estimates at the end.
     truth : mapping of str to array_like
         True values by reported name; may be empty.
     good_std, good_error : mapping of str to float
@@ -110,7 +110,7 @@ def check_limits(trial: Trial, limits: Iterable[str]) -> None:
     Parameters
     ----------
     trial : Trial
-        Whose sensors say what is estimated.
+        Trial whose sensors say what is estimated.
     limits : iterable of str
         Reported names.
     """

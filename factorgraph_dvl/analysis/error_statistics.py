@@ -97,7 +97,7 @@ class CalibrationErrors:
     names : tuple of str
         Names of the n components, as in `covariance.order`.
     estimate, truth, error : ndarray, shape (n,)
-        In reported units; error = estimate - truth.
+        Estimate, truth and error in reported units; error = estimate - truth.
     covariance : ndarray, shape (n, n)
         Joint covariance of the components.
     observable : ndarray of bool, shape (n,)

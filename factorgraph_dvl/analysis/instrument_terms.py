@@ -55,13 +55,13 @@ class InstrumentTerms:
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
     scale_grade : tuple of Grade
-        Of each scale error.
+        Grade of each scale error.
     lever_arm, lever_arm_std : ndarray, shape (3,)
         `origin` to DVL, forward, starboard, down, m.
     lever_arm_covariance : ndarray, shape (3, 3), m²
-        Of `lever_arm`.
+        Covariance of `lever_arm`.
     lever_arm_grade : tuple of Grade
-        Of its components.
+        Grades of the components of the lever arm.
     origin : str
         Where the lever arm starts: `IMU`, `INS` or `GNSS antenna`.
     alignment : ndarray, shape (3,)

@@ -1,4 +1,4 @@
-"""How a DVL is mounted, in words that hold for turns of any size."""
+"""How a DVL is mounted, in words that are right for turns of any size."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ class AxisNoise:
 
     @property
     def walk_over_hour(self) -> float:
-        """Random walk of the bias that wanders as much within an hour as walk and flicker."""
+        """Random walk of the bias that varies as much within an hour as walk and flicker."""
         return float(
             np.hypot(self.walk.value, self.instability.value * np.sqrt(3.0 * _FLICKER / 3600.0))
         )
@@ -91,7 +91,7 @@ class StaticNoise:
     Parameters
     ----------
     duration, rate : float
-        Of the stretch without gaps that was used, s, Hz.
+        Duration and rate of the stretch without gaps that was used, s, Hz.
     gyro, accel : tuple of AxisNoise
         X, y, z.
     """

@@ -41,7 +41,7 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     Parameters
     ----------
     trial : Trial
-        With IMU, GNSS and beams.
+        Trial with IMU, GNSS and beams.
     rate_hz : float
         Rate of the trajectory in the solution.
     report : callable

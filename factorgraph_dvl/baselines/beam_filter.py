@@ -118,11 +118,11 @@ def attitude_errors(
     Returns
     -------
     time : ndarray, shape (H,), s
-        Of the pings of a history.
+        Times of the pings of a history.
     phi : ndarray, shape (H, 3), rad
-        In true nRb = Exp(phi) nRb.
+        Error in true nRb = Exp(phi) nRb.
     covariance : ndarray, shape (H, 3, 3), rad²
-        Of phi.
+        Covariances of phi.
     """
     rows = history_rows(len(pings.measured))
     prior = prior_of(estimated.parameters)

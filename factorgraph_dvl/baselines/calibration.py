@@ -137,10 +137,11 @@ def calibrate(
     Parameters
     ----------
     trial : Trial
-        With IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS with a
-        compass, is what the DVL is compared with. Or a planar trial, with its first position.
+        Trial with IMU, GNSS and DVL, or its beams, or star tracker. Without IMU, an INS, or GNSS
+        with a compass, is what the DVL is compared with. Or a planar trial, with its first
+        position.
     method : Method, optional
-        By default `point-set`, and `4sv-3ob` for a planar trial.
+        Method; by default `point-set`, and `4sv-3ob` for a planar trial.
         `point-set` (seven states), `luo-2024` (the same as printed), `nine-state`,
         `nine-state-linear` (as printed), `nine-state-ukf`, `wahba`, `least-squares`,
         `differential-evolution`, `kinsey-whitcomb`, `three-points` (Tang et al.), or the fits

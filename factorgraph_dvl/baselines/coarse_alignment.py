@@ -43,9 +43,9 @@ class CoarseAttitude:
     nRb : ndarray, shape (3, 3)
         Local-level.
     covariance : ndarray, shape (3, 3), rad²
-        Of phi in Exp(phi) nRb.
+        Covariance of phi in Exp(phi) nRb.
     note : Message, optional
-        For the user.
+        Note for the user.
     """
 
     nRb: Array
@@ -68,7 +68,7 @@ def coarse_attitude(
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the events.
+        Times of the events.
     steps : Steps
         The K - 1 steps between.
     geodetic : ndarray, shape (K, 3)
@@ -78,9 +78,9 @@ def coarse_attitude(
     turning : ndarray, shape (K, 3)
         Velocity of the antenna relative to the IMU, in body, m/s.
     settings : ImuSettings
-        Of the IMU.
+        Settings of the IMU.
     body_axes : BodyAxes
-        Of the IMU.
+        Body axes of the IMU.
     """
     body, turn = _in_first_body_axes(steps)
     body = body + rotate(turn, turning)

@@ -37,11 +37,11 @@ def sins(
     Parameters
     ----------
     trial : Trial
-        With IMU and GNSS.
+        Trial with IMU and GNSS.
     align_s : float, optional
         Time from the first fix on during which GNSS is used, s; all by default.
     rate_hz : float, default 10.0
-        Of the motion.
+        Rate of the motion.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def _with_height_aiding(gnss: Gnss, running: Array) -> Gnss:
     Parameters
     ----------
     gnss : Gnss
-        With fixes.
+        GNSS with fixes.
     running : ndarray, shape (M,)
         Times of the IMU's samples, s: elsewhere no aiding is needed.
     """

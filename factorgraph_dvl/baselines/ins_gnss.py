@@ -48,11 +48,11 @@ class FilterState:
     nRb : ndarray, shape (3, 3)
         Attitude, body to local-level.
     gyro_bias : ndarray, shape (3,), rad/s
-        In body axes.
+        Gyro bias in body axes.
     accel_bias : ndarray, shape (3,), m/s²
-        In body axes.
+        Accelerometer bias in body axes.
     covariance : ndarray, shape (15, 15)
-        Of the errors.
+        Covariance of the errors.
     """
 
     geodetic: Array
@@ -70,13 +70,13 @@ class Fixes:
     Parameters
     ----------
     geodetic, velocity : ndarray, shape (K, 3)
-        Of the antenna.
+        Position and velocity of the antenna.
     position_variance, velocity_variance : ndarray, shape (K, 3)
         East, north, up.
     turning : ndarray, shape (K, 3), rad/s
         Reading of the gyros less the rate of the body on its carrier.
     lever_arm : ndarray, shape (3,) or (K, 3)
-        Of the antenna, in body, m.
+        Lever arm of the antenna, in body, m.
     """
 
     geodetic: Array
@@ -94,11 +94,11 @@ class FilteredTrack:
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the events.
+        Times of the events.
     geodetic, velocity, nRb, gyro_bias, accel_bias : ndarray, shape (K, ...)
-        As in `FilterState`.
+        Position, velocity, attitude, gyro bias and accelerometer bias as in `FilterState`.
     covariance : ndarray, shape (K, 15, 15)
-        Of the errors.
+        Covariances of the errors.
     apparent_gravity : ndarray, shape (K, 3), m/s²
         Gravity less Coriolis terms over the step that follows.
     frame_rate : ndarray, shape (K, 3), rad/s
@@ -124,7 +124,7 @@ def run_filter(
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the events.
+        Times of the events.
     steps : Steps
         The K - 1 steps between them.
     fixes : Fixes

@@ -31,7 +31,7 @@ class ForwardPass(Generic[TrackT]):
     track : TrackT
         Filtered states, after the measurement of each event.
     transition : ndarray, shape (K, n, n)
-        Of the step that ends at each event; the first is not used.
+        Transition of the step that ends at each event; the first is not used.
     predicted : ndarray, shape (K, n, n)
         Covariance before the measurement.
     correction : ndarray, shape (K, n)
@@ -78,7 +78,7 @@ def smoothed_errors(
     Parameters
     ----------
     forward : ForwardPass
-        From the filter.
+        Forward pass of the filter.
     added : callable, optional
         Returns the sum of the correction at an event and the smoothed error there.
     """

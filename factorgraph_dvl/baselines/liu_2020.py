@@ -32,13 +32,13 @@ def run_printed(
     Parameters
     ----------
     samples : StrapdownSamples
-        Of the IMU.
+        Samples of the IMU.
     attitudes : StarAttitudes
         Attitudes within the arc.
     lat : float
         Latitude of n, rad; its rate is that of the Earth.
     drift_covariance : ndarray, shape (3, 3), rad²/s²
-        Of the drift beforehand.
+        Covariance of the drift in advance.
     """
     steps = compose(samples, attitudes.time[:-1], attitudes.time[1:])
     omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])

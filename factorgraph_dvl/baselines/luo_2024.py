@@ -51,9 +51,9 @@ def as_printed(
     points : Points
         The two point sets, of SINS/GNSS without smoothing.
     misalignment, scale, lever_arm : Parameter
-        With their priors; one scale for the three axes.
+        Misalignment, scale and lever arm with their priors; one scale for the three axes.
     factor : float, default 3000
-        Of R.
+        Factor on R.
     threshold : float, default 1 deg, rad
         Angle from which on data are rotated.
     """

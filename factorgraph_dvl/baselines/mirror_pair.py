@@ -47,7 +47,7 @@ def mirror_pair(trial: Trial, times: tuple[float, float, float]) -> tuple[Array,
     Parameters
     ----------
     trial : Trial
-        With one beacon, on a straight run over the times.
+        Trial with one beacon, on a straight run over the times.
     times : tuple of (float, float, float)
         When the ranges are taken, s.
 

@@ -97,11 +97,11 @@ class NavigationMotion:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        On the clock of the IMU.
+        Times on the clock of the IMU.
     geodetic, velocity, nRb : ndarray
         Local-level, as in `FilteredTrack`.
     covariance : ndarray, shape (M, 9, 9)
-        Of the errors of position, velocity, attitude.
+        Covariances of the errors of position, velocity, attitude.
     v_b : ndarray, shape (M, 3), m/s
         Velocity over the Earth in body.
     v_b_covariance : ndarray, shape (M, 3, 3), m²/s²
@@ -133,7 +133,7 @@ def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation
     Parameters
     ----------
     trial : Trial
-        With GNSS.
+        Trial with GNSS.
     pings : ndarray, shape (M,), s
         True times of the pings.
     smoothed : bool, default True

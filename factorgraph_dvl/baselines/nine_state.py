@@ -44,9 +44,9 @@ def nine_state(
     points : Points
         The two point sets.
     misalignment, scale, bias : Parameter
-        With their priors; the bias one gets a prior of 0.5 m/s where the trial has none.
+        Parameters with their priors; the bias gets a prior of 0.5 m/s where the trial has none.
     lever_arm : ndarray, shape (3,)
-        Of the DVL, m, taken as known.
+        Lever arm of the DVL, m, taken as known.
     iterated : bool, default True
         False = the plain linear filter, about the prior mean.
     """
@@ -238,7 +238,7 @@ def unscented(
     parameters : tuple of (Parameter, Parameter, Parameter)
         Misalignment, three scale errors and bias, with their priors.
     lever_arm : ndarray, shape (3,)
-        Of the DVL, m, taken as known.
+        Lever arm of the DVL, m, taken as known.
     findings : sequence of Finding
         What is already known.
 

@@ -28,11 +28,11 @@ class History:
     Parameters
     ----------
     time : ndarray, shape (H,), s
-        On the clock of the IMU.
+        Times on the clock of the IMU.
     names : tuple of str
-        Of the n components, as in `covariance.order`.
+        Names of the n components, as in `covariance.order`.
     values, std : ndarray, shape (H, n)
-        In reported units.
+        Values and standard deviations in reported units.
     """
 
     time: Array
@@ -48,9 +48,9 @@ class Estimated:
     Parameters
     ----------
     parameters : tuple of Parameter
-        With their priors.
+        Parameters with their priors.
     values : tuple of ndarray
-        Of each, (n,); a rotation as its matrix.
+        Values of each parameter, (n,); a rotation as its matrix.
     covariance : ndarray
         Joint, stacked; of a rotation R, of delta in R Exp(delta).
     """
@@ -92,13 +92,13 @@ class Outcome:
     Parameters
     ----------
     estimated : Estimated
-        At the end.
+        Estimates at the end.
     iterations : int
         Passes over the data, or rotations of them.
     history : tuple of tuple of (float, Estimated), optional
         Time and estimate after some of the pings; empty for closed forms.
     findings : tuple of Finding, optional
-        For the user.
+        Findings for the user.
     unseparated : frozenset of str, optional
         Component names that the data alone do not separate.
     converged : bool, optional

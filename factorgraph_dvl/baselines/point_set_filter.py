@@ -59,7 +59,7 @@ def point_set(
     points : Points
         The two point sets.
     misalignment, scale, lever_arm : Parameter
-        With their priors; one scale for the three axes.
+        Misalignment, scale and lever arm with their priors; one scale for the three axes.
     """
     prior = prior_of((misalignment, scale, lever_arm))
     starts = rotation_starts(misalignment)
@@ -104,9 +104,9 @@ class _Sums:
     information : ndarray, shape (7, 7)
         A.
     by_rotation : ndarray, shape (7, 3, 3)
-        Of H' R^-1 and v_d, by the rows and columns of D.
+        Product of H' R^-1 and v_d, by the rows and columns of D.
     by_body : ndarray, shape (7,)
-        Of H' R^-1 v_b.
+        Product of H' R^-1 v_b.
     """
 
     information: Array

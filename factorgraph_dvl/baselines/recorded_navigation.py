@@ -30,9 +30,10 @@ class RecordedNavigation:
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the positions.
+        Times of the positions.
     geodetic, velocity : ndarray, shape (K, 3)
-        Of the body: latitude, longitude (rad), height (m); east, north, up, m/s.
+        Position and velocity of the body: latitude, longitude (rad), height (m); east, north, up,
+        m/s.
     std : ndarray, shape (K, 9)
         Standard deviations of position, velocity, and attitude: m, m/s, rad.
     attitude : AttitudeRecord
@@ -91,7 +92,7 @@ def recorded_navigation(trial: Trial) -> RecordedNavigation:
     Parameters
     ----------
     trial : Trial
-        Without IMU; GNSS by the clock of the trial.
+        Trial without IMU; GNSS by the clock of the trial.
 
     Raises
     ------

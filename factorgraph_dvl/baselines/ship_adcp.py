@@ -49,13 +49,13 @@ def horizontal(
     Parameters
     ----------
     motion : NavigationMotion
-        Of the ship.
+        Motion of the ship.
     v_d : ndarray, shape (M, 3), m/s
-        Of the ADCP, in its axes.
+        Velocity of the ADCP, in its axes.
     misalignment : Parameter
         Nominal mounting.
     lever_arm : ndarray, shape (3,), m
-        To the ADCP, in body.
+        Lever arm to the ADCP, in body.
     """
     ship = motion.velocity + rotate(motion.nRb, np.cross(motion.omega_b, lever_arm))
     adcp = rotate(motion.nRb @ exp_so3(misalignment.mean).T, v_d)
@@ -70,7 +70,7 @@ def joyce(
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the pings.
+        Times of the pings.
     ship, adcp : ndarray of complex, shape (M,), m/s
         Horizontal velocities.
     water : bool
@@ -102,9 +102,9 @@ def pollard_read(
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the pings.
+        Times of the pings.
     heading : ndarray, shape (M,), rad
-        Of the ship.
+        Heading of the ship.
     ship, adcp : ndarray of complex, shape (M,), m/s
         Horizontal velocities.
     water : bool

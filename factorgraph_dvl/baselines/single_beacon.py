@@ -53,11 +53,11 @@ class Filtered:
     Parameters
     ----------
     time : ndarray, shape (U,), s
-        Of the updates.
+        Times of the updates.
     state : ndarray, shape (U, 4)
         Position in n, m, and current, m/s.
     covariance : ndarray, shape (U, 4, 4)
-        Of the state.
+        Covariances of the state.
     velocity : ndarray, shape (U, 2), m/s
         Over ground.
     innovations : tuple of Residuals
@@ -82,7 +82,7 @@ def filter_planar(
     Parameters
     ----------
     trial : Trial
-        With `initial.position`: the filters cannot find it.
+        Trial with `initial.position`: the filters cannot find it.
     method : Method
         `4sv-2ob` or `4sv-3ob`.
     progress : callable, optional
@@ -93,7 +93,7 @@ def filter_planar(
     solution : Solution
         Its trajectory is filtered, not smoothed: an epoch for each update.
     history : History
-        Of the current.
+        History of the current.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def run_filter(trial: Trial, method: Method | str, mean: Array, std: Array) -> F
     Parameters
     ----------
     trial : Trial
-        With heading, log, depth and beacons.
+        Trial with heading, log, depth and beacons.
     method : Method or str
         `4sv-2ob` or `4sv-3ob`.
     mean, std : ndarray, shape (2,), m

@@ -32,7 +32,7 @@ def without_spurious_information(
     points, estimated : Points or Estimated
         The pings and the calibration.
     lever_arm : ndarray
-        Of the DVL where the calibration has none, m.
+        Lever arm of the DVL where the calibration has none, m.
     """
     if len(points) == 0:
         return estimated
@@ -84,7 +84,7 @@ def widened(estimated: Estimated, information: Array, noise: Array) -> Estimated
     estimated : Estimated
         N components.
     information : ndarray, shape (n, n)
-        Of the data, with the spurious part.
+        Information of the data, with the spurious part.
     noise : ndarray, shape (n, n)
         Mean of the spurious part.
     """

@@ -65,11 +65,11 @@ def calibrate_gyros(
     Parameters
     ----------
     trial : Trial
-        With IMU, GNSS and star tracker.
+        Trial with IMU, GNSS and star tracker.
     rate_hz : float
         Rate of the trajectory in the solution.
     printed : bool, default False
-        By the filter as Liu et al. (2020) print it.
+        Whether to use the filter as Liu et al. (2020) print it.
 
     Raises
     ------

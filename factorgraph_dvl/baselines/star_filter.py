@@ -39,11 +39,11 @@ class StarAttitudes:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        On the clock of the IMU.
+        Times on the clock of the IMU.
     nRb : ndarray, shape (M, 3, 3)
         Body to n, by the prior mounting.
     covariance : ndarray, shape (M, 3, 3), rad²
-        Of phi in nRb Exp(phi).
+        Covariances of phi in nRb Exp(phi).
     """
 
     time: Array
@@ -63,13 +63,13 @@ class AttitudeTrack:
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        On the clock of the IMU.
+        Times on the clock of the IMU.
     nRb : ndarray, shape (K, 3, 3)
         Body to n.
     drift : ndarray, shape (K, 3), rad/s
-        Of the gyros.
+        Drift of the gyros.
     covariance : ndarray, shape (K, 6, 6)
-        Of dq and xi.
+        Covariances of dq and xi.
     """
 
     time: Array
@@ -119,7 +119,7 @@ def run_filter(
     Parameters
     ----------
     samples : StrapdownSamples
-        Of the IMU.
+        Samples of the IMU.
     attitudes : StarAttitudes
         Attitudes within the arc.
     lat : float
@@ -127,7 +127,7 @@ def run_filter(
     drift : ndarray, shape (3,), rad/s
         Known before.
     drift_covariance : ndarray, shape (3, 3), rad²/s²
-        Of that.
+        Covariance of the drift.
     """
     steps = compose(samples, attitudes.time[:-1], attitudes.time[1:])
     walk = samples.settings.gyro_bias_walk_root_psd**2
@@ -181,7 +181,7 @@ def attitude_at(
     nRb : ndarray, shape (M, 3, 3)
         Body to n.
     covariance : ndarray, shape (M, 3, 3), rad²
-        Of phi in Exp(phi) nRb.
+        Covariances of phi in Exp(phi) nRb.
     """
     omega_in = RATE * np.array([0.0, np.cos(lat), np.sin(lat)])
     before = np.clip(np.searchsorted(track.time, time, side="right") - 1, 0, None)

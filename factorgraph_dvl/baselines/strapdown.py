@@ -28,7 +28,7 @@ class StrapdownSamples:
         Sum, before each interval, of the variances of rotation (rad²) and velocity (m²/s²) that
         the samples leave open.
     settings : ImuSettings
-        Of the IMU, for its noise.
+        Settings of the IMU, for its noise.
     """
 
     increments: Increments
@@ -45,7 +45,7 @@ class Steps:
     Parameters
     ----------
     duration : ndarray, shape (M,), s
-        Of the steps.
+        Duration of the steps.
     turn : ndarray, shape (M, 3, 3)
         Rotation, body axes at the end to those at the start.
     dv, dp : ndarray, shape (M, 3)
@@ -53,7 +53,7 @@ class Steps:
     bias_jacobian : ndarray, shape (M, 3, 3)
         Integral of the rotation to the start, s: what a bias adds up to.
     gyro_variance, accel_variance : ndarray, shape (M,)
-        Of rotation (rad²) and velocity (m²/s²), per axis.
+        Variances of rotation (rad²) and velocity (m²/s²), per axis.
     """
 
     duration: Array
@@ -75,7 +75,7 @@ def prepare(increments: Increments, settings: ImuSettings) -> StrapdownSamples:
 
 
 def at_times(samples: StrapdownSamples, time: Array) -> tuple[np.ndarray, Partial]:
-    """Return the intervals that hold times (M,), and the motion within them up to there."""
+    """Return the intervals that contain times (M,), and the motion within them up to there."""
     inc = samples.increments
     index, since, _ = inc.locate(time)
     return index, inc.partial(index, np.clip(since, 0.0, inc.dt[index]))

@@ -48,17 +48,17 @@ def summarise(
     Parameters
     ----------
     trial : Trial
-        That was solved.
+        Trial that was solved.
     navigation : Navigation or RecordedNavigation
-        Of SINS/GNSS, or what instruments report.
+        Navigation of SINS/GNSS, or what instruments report.
     outcome : Outcome
-        Of the calibrator.
+        Outcome of the calibrator.
     aid : Aid
         The sensor that was calibrated.
     measured : Residuals
-        Of that sensor.
+        Residuals of that sensor.
     motion : Motion or None
-        At its measurements.
+        Motion at its measurements.
     solver : str
         Name.
     rate_hz : float
@@ -149,11 +149,11 @@ def dvl_residuals(
     Parameters
     ----------
     dvl : Dvl
-        That was calibrated.
+        DVL that was calibrated.
     navigation : Navigation or RecordedNavigation
-        Of SINS/GNSS, or what instruments report.
+        Navigation of SINS/GNSS, or what instruments report.
     outcome : Outcome
-        Of the calibrator.
+        Outcome of the calibrator.
     points : Points
         The point sets at the prior's time offset.
     """

@@ -2,7 +2,7 @@
 
 The rotation that best takes one point set to the other is Wahba's problem; the scale
 follows by projection. Time-independent, without lever arm, bias or recursion: the trial's
-own lever arm is taken off beforehand.
+own lever arm is taken off in advance.
 
 Umeyama, IEEE Trans. PAMI 13(4), 1991.
 """
@@ -30,9 +30,9 @@ def wahba(points: Points, misalignment: Parameter, scale: Parameter, lever_arm: 
     points : Points
         The two point sets.
     misalignment, scale : Parameter
-        With their priors.
+        Misalignment and scale with their priors.
     lever_arm : ndarray, shape (3,)
-        Of the DVL, m, taken as known.
+        Lever arm of the DVL, m, taken as known.
     """
     v, weight = points.at_dvl(lever_arm), point_weights(points)
     power = float(weight @ np.sum(v**2, axis=1))

@@ -31,9 +31,9 @@ class Change:
     after : int
         Last trial before it.
     component : int
-        That stepped.
+        Component that stepped.
     probability : float
-        Of as clear a step anywhere, in any component, if there were none.
+        Probability of as clear a step anywhere, in any component, if there were none.
     """
 
     after: int
@@ -91,7 +91,7 @@ def step_scores(found: Fit, omitted: Sequence[int] = ()) -> StepScores:
     Parameters
     ----------
     found : Fit
-        Without the steps.
+        Fit without the steps.
     omitted : sequence of int, optional
         Components that are not tested.
     """
@@ -122,9 +122,9 @@ def next_step(
     Parameters
     ----------
     information : Information
-        Of N trials, in order.
+        Information of N trials, in order.
     effects : sequence of Effect, optional
-        To estimate besides.
+        Effects to estimate besides the common value.
     omitted : sequence of int, optional
         Components that are not tested.
     """
@@ -210,11 +210,12 @@ class Drift:
     Parameters
     ----------
     component : int
-        That drifts.
+        Component that drifts.
     variance : float
-        Of its walk, squared reported units a day, or a trial where the dates are not known.
+        Variance of its walk, squared reported units a day, or a trial where the dates are not
+        known.
     probability : float
-        Of as clear a drift if there were none.
+        Probability of as clear a drift if there were none.
     """
 
     component: int
@@ -243,11 +244,11 @@ def drift_of(
     Parameters
     ----------
     information : Information
-        Of N trials, in order.
+        Information of N trials, in order.
     found : Fit
-        Without the drift.
+        Fit without the drift.
     component : int
-        That may drift.
+        Component that may drift.
     days : ndarray, shape (N,)
         Times of the trials.
 

@@ -116,7 +116,7 @@ def records(
     Parameters
     ----------
     client : Client
-        Of the workers.
+        Client of the workers.
     runs : sequence of tuple of (callable, tuple)
         Functions that return a record, and their arguments.
     labels : sequence of str

@@ -59,7 +59,7 @@ def write_campaign(campaign: Campaign, out: Path) -> None:
     """
     _write_table(out / TRIALS_FILE, _trial_columns(campaign))
     if campaign.joint is not None:
-        next_trial = _for_the_next(campaign, campaign.joint)
+        next_trial = for_the_next(campaign, campaign.joint)
         write_whole(out / CALIBRATION_FILE, encode_calibration(next_trial))
     write_whole(out / CAMPAIGN_FILE, _json(campaign_content(campaign)))
 
@@ -74,9 +74,9 @@ def write_seeds(
     found : MonteCarlo or None
         Statistics of the seeds.
     records : sequence of SeedRecord
-        Of the seeds.
+        Records of the seeds.
     scenario : path-like
-        That was simulated.
+        Scenario that was simulated.
     out : path-like
         Folder of the campaign.
     """
@@ -110,7 +110,7 @@ def write_seeds(
 
 
 def campaign_content(campaign: Campaign) -> dict[str, Any]:
-    """Return what campaign.json holds.
+    """Return what campaign.json contains.
 
     Parameters
     ----------
@@ -200,8 +200,16 @@ def _calibration(joint: JointCalibration, value: Array, covariance: Array) -> di
     return {"parameters": parameters, "covariance": matrix}
 
 
-def _for_the_next(campaign: Campaign, joint: JointCalibration) -> Calibration:
-    """Return what is known of the calibration in a trial to come: its own variation added."""
+def for_the_next(campaign: Campaign, joint: JointCalibration) -> Calibration:
+    """Return what is known of the calibration in a trial to come: its own variation added.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        Trials; at least one is used.
+    joint : JointCalibration
+        Their joint calibration.
+    """
     covariance = joint.covariance + np.diag(joint.between_std**2)
     std = np.sqrt(np.diag(covariance))
     place = {name: i for i, name in enumerate(joint.information.names)}

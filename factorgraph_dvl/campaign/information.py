@@ -36,7 +36,7 @@ class Information:
     Parameters
     ----------
     names : tuple of str
-        Of the components, as in `covariance.order`.
+        Names of the components, as in `covariance.order`.
     matrix : ndarray, shape (N, n, n)
         Information of the data.
     weighted : ndarray, shape (N, n)
@@ -85,11 +85,11 @@ class TrialCalibration:
     Parameters
     ----------
     calibration : Calibration
-        As in calibration.json.
+        Calibration as in calibration.json.
     prior_names : tuple of str, optional
         Components that an earlier calibration was the prior of.
     prior_covariance : ndarray, shape (m, m), optional
-        Of these, in reported units.
+        Prior covariance of these, in reported units.
 
     Examples
     --------
@@ -110,7 +110,7 @@ def information_of(trials: Sequence[TrialCalibration]) -> Information:
     Parameters
     ----------
     trials : sequence of TrialCalibration
-        With body axes and beams in common.
+        Trials with body axes and beams in common.
 
     Examples
     --------

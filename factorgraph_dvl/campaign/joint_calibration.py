@@ -29,13 +29,13 @@ class JointCalibration:
     Parameters
     ----------
     information : Information
-        Of the N trials on n components, in order.
+        Information of the N trials on n components, in order.
     days : ndarray, shape (N,)
         Times of the trials; their numbers where dates are not known.
     fit : Fit
-        With variance between trials, changes, slopes and drifts.
+        Fit with variance between trials, changes, slopes and drifts.
     variance_probability : ndarray, shape (n,)
-        Of each variance between trials, if there were none.
+        Probability of each variance between trials, if there were none.
     changes : tuple of Change
         Steps between trials, in order.
     slopes : tuple of Slope
@@ -98,7 +98,7 @@ def joint_calibration(
     Parameters
     ----------
     information : Information
-        Of N trials, in order.
+        Information of N trials, in order.
     days : ndarray, shape (N,)
         Times of the trials.
     covariates : mapping of str to ndarray, shape (N,), optional
@@ -186,11 +186,11 @@ class Slope:
     covariate : str
         Name.
     component : int
-        That follows.
+        Component that follows.
     profile : ndarray, shape (N,)
         The covariate less its mean, in each trial.
     probability : float
-        Of as clear a slope in any component, by any covariate, if there were none.
+        Probability of as clear a slope in any component, by any covariate, if there were none.
     """
 
     covariate: str
@@ -212,11 +212,11 @@ def slopes(
     Parameters
     ----------
     information : Information
-        Of N trials.
+        Information of N trials.
     covariates : mapping of str to ndarray, shape (N,)
         Values in each trial.
     effects : sequence of Effect, optional
-        To estimate besides.
+        Effects to estimate besides the common value.
     """
     profiles = {n: v - v.mean() for n, v in covariates.items() if np.ptp(v) > 0.0}
     size = information.prior_std.size

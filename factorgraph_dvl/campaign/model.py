@@ -20,11 +20,11 @@ class Effect:
     Parameters
     ----------
     component : int
-        That it moves.
+        Component that it moves.
     profile : ndarray, shape (N,)
-        By how many of its sizes, in each trial.
+        Number of its sizes in each trial.
     variance : float, optional
-        Of its size before the trials, in reported units; infinite by default.
+        Variance of its size before the trials, in reported units; infinite by default.
     """
 
     component: int
@@ -42,19 +42,19 @@ class Fit:
     Parameters
     ----------
     information : Information
-        Of the trials.
+        Information of the trials.
     effects : tuple of Effect
-        That are estimated.
+        Effects that are estimated.
     scale : ndarray, shape (n,)
-        Of each component, in reported units.
+        Scale of each component, in reported units.
     variance : ndarray, shape (n,)
-        Between trials, T.
+        Variance between trials, T.
     weight : ndarray, shape (N, n, n)
         The inverse covariance of each trial, W.
     design : ndarray, shape (N, n, n + p)
         Derivative of the value of each trial by common value and effects.
     covariance : ndarray, shape (n + p, n + p)
-        Of common value and effects.
+        Covariance of common value and effects.
     estimate : ndarray, shape (n + p,)
         Common value, relative to the origin, and sizes of the effects.
     score : ndarray, shape (N, n)
@@ -116,11 +116,11 @@ def fit(information: Information, variance: Array, effects: Sequence[Effect] = (
     Parameters
     ----------
     information : Information
-        Of N trials on n components.
+        Information of N trials on n components.
     variance : ndarray, shape (n,)
-        Between trials, in units of `scale_of`.
+        Variance between trials, in units of `scale_of`.
     effects : sequence of Effect, optional
-        To estimate with the common value.
+        Effects to estimate with the common value.
     """
     scale = scale_of(information)
     n, count = scale.size, information.square.size
@@ -189,9 +189,9 @@ def fitted(information: Information, effects: Sequence[Effect] = ()) -> Fit:
     Parameters
     ----------
     information : Information
-        Of N trials on n components.
+        Information of N trials on n components.
     effects : sequence of Effect, optional
-        To estimate with the common value.
+        Effects to estimate with the common value.
     """
     return _maximise(information, effects, np.ones(information.prior_std.size, dtype=bool))
 
@@ -204,7 +204,7 @@ def probabilities(found: Fit) -> Array:
     Parameters
     ----------
     found : Fit
-        As of `fitted`.
+        Fit as of `fitted`.
     """
     out = np.ones(found.size)
     for k in np.flatnonzero(found.variance > 0.0):

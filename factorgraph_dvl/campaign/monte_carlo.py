@@ -82,7 +82,7 @@ def monte_carlo(records: Sequence[SeedRecord]) -> MonteCarlo | None:
     Parameters
     ----------
     records : sequence of SeedRecord
-        Of the seeds.
+        Records of the seeds.
     """
     solved = [r for r in records if r.done and r.names]
     if not solved:
@@ -138,13 +138,13 @@ class SeedRecord(RunRecord, kw_only=True):
     Parameters
     ----------
     names : list of str
-        Of the n components whose truth is known and that the data determine.
+        Names of the n components whose truth is known and that the data determine.
     deviation : list of float
         Estimate less truth, (n,), without what the prior pulls.
     covariance : list of list of float
-        Of the deviation, (n, n).
+        Covariance of the deviation, (n, n).
     grade : str
-        Of the verdict.
+        Grade of the verdict.
     """
 
     names: list[str] = msgspec.field(default_factory=list)

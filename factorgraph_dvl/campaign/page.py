@@ -75,7 +75,7 @@ def write_seed_page(found: MonteCarlo | None, scenario: Path, runs: int, out: Pa
     found : MonteCarlo or None
         Statistics of the seeds that were solved.
     scenario : path-like
-        That was simulated.
+        Scenario that was simulated.
     runs : int
         Number of seeds.
     out : path-like

@@ -23,15 +23,15 @@ class RunRecord(msgspec.Struct, kw_only=True):
     Parameters
     ----------
     name : str
-        Of the trial, or the number of the seed.
+        Name of the trial, or the number of the seed.
     fingerprint : str
-        Of all that the run depends on; see `fingerprint_of`.
+        Fingerprint of all that the run depends on; see `fingerprint_of`.
     done : bool
         Whether it has a result.
     error : str, optional
         Why it has none.
     epoch : str, optional
-        Of the trial, ISO 8601.
+        Epoch of the trial, ISO 8601.
     wall_s, cpu_s, peak_bytes : float or int, optional
         What it took.
     result : str, optional
@@ -39,7 +39,7 @@ class RunRecord(msgspec.Struct, kw_only=True):
     prior_names : list of str, optional
         Components that an earlier calibration was the prior of.
     prior_covariance : list of list of float, optional
-        Of these, in reported units.
+        Prior covariance of these, in reported units.
     """
 
     name: str
@@ -89,7 +89,7 @@ def fingerprint_of(files: Iterable[Path], options: Mapping[str, str]) -> str:
     Parameters
     ----------
     files : iterable of path-like
-        That a run reads; those that do not exist count as empty.
+        Files that a run reads; those that do not exist count as empty.
     options : mapping of str to str
         What else its result depends on.
     """

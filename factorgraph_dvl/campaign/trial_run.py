@@ -49,7 +49,7 @@ def run_trial(trial: str, label: str, out: str, options: Sequence[str]) -> RunRe
     out : str
         Folder of the campaign, absolute.
     options : sequence of str
-        Of the command `solve`.
+        Options of the command `solve`.
     """
     folder = Path(out) / TRIALS_FOLDER / label
     file = folder.with_name(f"{label}.json")

@@ -33,9 +33,9 @@ class CampaignTrial:
     label : str
         Name of the folder with its result.
     name : str
-        As its trial.yaml has it.
+        Name as the trial.yaml has it.
     path : str
-        Of the trial.
+        Path of the trial.
     record : RunRecord
         How its run ended.
     calibration : Calibration or None
@@ -59,11 +59,11 @@ class Campaign:
     Parameters
     ----------
     trials : tuple of CampaignTrial
-        By date, or as given where a date is missing.
+        Trials by date, or as given where a date is missing.
     dated : bool
         Whether all have a date.
     joint : JointCalibration or None
-        Of the trials that are used; None if there are none.
+        Joint calibration of the trials that are used; None if there are none.
     """
 
     trials: tuple[CampaignTrial, ...]
@@ -113,7 +113,7 @@ def assembled(
     Parameters
     ----------
     paths, labels, records : sequence of path-like, str, RunRecord
-        Of the trials.
+        Paths, labels and records of the trials.
     out : path-like
         Folder of the campaign.
     anyway : bool, default False
@@ -164,7 +164,7 @@ def read_covariates(path: Path) -> dict[str, dict[str, float]]:
     Parameters
     ----------
     path : path-like
-        Of the table.
+        Path of the table.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def check_covariates(covariates: Mapping[str, Mapping[str, float]], names: Seque
     covariates : mapping of str to mapping of str to float
         Value in each trial, by covariate and the trial's name.
     names : sequence of str
-        Of the trials.
+        Names of the trials.
     """
     for covariate, values in covariates.items():
         for name in names:

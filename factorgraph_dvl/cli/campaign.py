@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from factorgraph_dvl.cli.console import CountLine, print_folder, stderr, stdout, warn
+from factorgraph_dvl.cli.console import (
+    CountLine,
+    print_folder,
+    print_table,
+    stderr,
+    stdout,
+    warn,
+)
 from factorgraph_dvl.cli.exit_codes import NO_RESULT
 from factorgraph_dvl.cli.options import (
     Anyway,
@@ -19,6 +26,7 @@ from factorgraph_dvl.cli.options import (
     Quiet,
     claim_output,
 )
+from factorgraph_dvl.cli.verdict import print_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -201,30 +209,30 @@ def _run(
 
 
 def _print_campaign(found: Campaign) -> None:
-    console = stdout()
+    """Print the verdict of the whole, the joint calibration, changes, and trials by verdict."""
+    from factorgraph_dvl.campaign.files import for_the_next
+    from factorgraph_dvl.campaign.tables import joint_table, trials_table
+    from factorgraph_dvl.quality.notation import with_std
     from factorgraph_dvl.quality.texts import text_of
 
-    unused = [t for t in found.trials if t.unused]
-    for t in unused:
-        warn(f"{t.label} is not used: {text_of(t.unused)}")
     joint = found.joint
+    if joint is not None:
+        print_verdict(for_the_next(found, joint).verdict)
+    for t in found.trials:
+        if t.unused:
+            warn(f"{t.label} is not used: {text_of(t.unused)}")
     if joint is None:
         warn("no trial has a result that can be used: there is no joint calibration")
-        return
-    from factorgraph_dvl.quality.notation import with_std
-
-    std = [float(v) ** 0.5 for v in joint.covariance.diagonal()]
-    for k, name in enumerate(joint.information.names):
-        text = f"{name}: {with_std(float(joint.value[k]), std[k])}"
-        text += f", between trials {joint.between_std[k]:.2g}"
-        console.print(text, markup=False, soft_wrap=True)
-    for i, change in enumerate(joint.changes):
-        text = (
-            f"Change after {found.used[change.after].name}: "
-            f"{joint.information.names[change.component]} by {with_std(*joint.step(i))}, "
-            f"p = {change.probability:.1g}"
-        )
-        console.print(text, markup=False, soft_wrap=True)
+    else:
+        print_table(joint_table(found, joint), "unit")
+        for i, change in enumerate(joint.changes):
+            text = (
+                f"Change after {found.used[change.after].name}: "
+                f"{joint.information.names[change.component]} by {with_std(*joint.step(i))}, "
+                f"p = {change.probability:.1g}"
+            )
+            stdout().print(text, markup=False, soft_wrap=True)
+    print_table(trials_table(found))
 
 
 def _end(failed: int, count: int) -> None:

@@ -144,7 +144,7 @@ def command(name: str) -> TyperCommand:
     Parameters
     ----------
     name : str
-        As on the command line.
+        Name as on the command line.
     """
     module, function = COMMANDS[name][0].split(".")
     alone = typer.Typer(add_completion=False, pretty_exceptions_enable=False)

@@ -71,10 +71,11 @@ def _lines(text: str) -> str:
 
 
 class ProgressLine:
-    """One line of stage, iteration, cost, time and time left; none where nothing is drawn over."""
+    """One line of stage, iteration, cost, time and time left; in a file or pipe a line a stage."""
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
+        self._stage = ""
         self._start = perf_counter()
         self._done = 0.0
         self._live = _live_line(
@@ -113,9 +114,9 @@ class ProgressLine:
         stage : str
             What begins, or goes on.
         iteration : int, optional
-            Of the stage.
+            Iteration of the stage.
         cost : float, optional
-            Of the iteration.
+            Cost of the iteration.
         done : float, optional
             Share of the run that is done; by default that of the stage, if it is a solver's.
         """
@@ -127,6 +128,11 @@ class ProgressLine:
             if not self._quiet:
                 rounded = None if left is None else round(left, 1)
                 events.emit(events.Progress(stage, round(elapsed, 3), iteration, cost, rounded))
+            return
+        if self._live.disable:
+            if not self._quiet and stage != self._stage:
+                stderr().print(f"{elapsed:6.1f} s: {stage}", markup=False, highlight=False)
+            self._stage = stage
             return
         text = stage
         if iteration:
@@ -158,10 +164,10 @@ def share_done(stage: str, iteration: int) -> float | None:
 
 
 class CountLine:
-    """A bar of runs that have ended, with the time left; none where nothing is drawn over."""
+    """A bar of runs that have ended, with the time left; in a file or pipe a line a run."""
 
     def __init__(self, total: int, *, quiet: bool) -> None:
-        self._quiet, self._done = quiet, 0
+        self._quiet, self._done, self._total = quiet, 0, total
         self._start = perf_counter()
         self._live = _live_line(
             BarColumn(),
@@ -187,6 +193,9 @@ class CountLine:
         if events.active() and not self._quiet:
             elapsed = perf_counter() - self._start
             events.emit(events.Progress(printable(text), round(elapsed, 3), self._done))
+        elif self._live.disable and not self._quiet:
+            line = f"{self._done} of {self._total}: {printable(text)}"
+            stderr().print(line, markup=False, highlight=False, soft_wrap=True)
         self._live.update(self._task, advance=1, description=printable(text))
 
 

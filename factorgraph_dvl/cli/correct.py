@@ -8,14 +8,12 @@ from typing import Annotated
 import typer
 
 from factorgraph_dvl.cli.console import print_written, say, stdout, warn
-from factorgraph_dvl.cli.options import Anyway, Force, TrialPath, claim_output
+from factorgraph_dvl.cli.options import Anyway, CalibrationPath, Force, TrialPath, claim_output
 
 
 def correct(
     trial_path: TrialPath,
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
-    ],
+    calibration: CalibrationPath,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     force: Force = False,
     anyway: Anyway = False,

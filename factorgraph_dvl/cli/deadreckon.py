@@ -46,7 +46,9 @@ def deadreckon(
     trial_path: TrialPath,
     calibration: Annotated[
         Path,
-        typer.Option(metavar="FILE", help="calibration.json, its folder, or a file of values."),
+        typer.Argument(
+            metavar="CALIBRATION", help="calibration.json, its folder, or a file of values."
+        ),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to write.")],
     attitude: Annotated[
@@ -70,7 +72,7 @@ def deadreckon(
     """Integrate the DVL's velocity before and after calibration, and compare the tracks.
 
     Examples:
-      factorgraph-dvl deadreckon data/seed-a-phase-90 --calibration out --out out/deadreckon
+      factorgraph-dvl deadreckon data/seed-a-phase-90 out --out out/deadreckon
     """
     from factorgraph_dvl.analysis.dead_reckoning.before_after import before_after
     from factorgraph_dvl.errors import as_text

@@ -22,7 +22,7 @@ def errors_in(trial: Trial, *, anyway: bool) -> tuple[Finding, ...]:
     Parameters
     ----------
     trial : Trial
-        As loaded.
+        Trial as loaded.
     anyway : bool
         Go on where records cannot be used.
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from factorgraph_dvl.cli.console import stdout
-from factorgraph_dvl.cli.options import Anyway, Target
+from factorgraph_dvl.cli.options import Anyway, CalibrationPath, Target
 from factorgraph_dvl.cli.verdict import end_with
 
 
 def instrument(
-    calibration: Annotated[
-        Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
-    ],
+    calibration: CalibrationPath,
     target: Annotated[
         Target | None,
         typer.Option("--for", metavar="TARGET", help=f"As settings: {', '.join(Target)}."),

@@ -13,6 +13,9 @@ import typer
 TrialPath = Annotated[
     Path, typer.Argument(metavar="TRIAL", help="Trial folder, or the trial.yaml in it.")
 ]
+CalibrationPath = Annotated[
+    Path, typer.Argument(metavar="CALIBRATION", help="calibration.json, or its folder.")
+]
 SolutionPath = Annotated[
     Path, typer.Option("--out", metavar="DIR", help="Solution folder to write.")
 ]

@@ -289,7 +289,7 @@ def _print(trial: Trial, solution: Solution, record: ReplayRecord, found: Conver
         known_errors,
     )
 
-    print_verdict(solution)
+    print_verdict(solution.verdict)
     console = stdout()
     truth = trial.calibration_truth
     errors = calibration_errors(solution, truth) if truth else None

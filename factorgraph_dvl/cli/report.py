@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,13 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
 
 
+class ReportLanguage(StrEnum):
+    """Languages of a report on paper."""
+
+    ENGLISH = "en"
+    CHINESE = "zh"
+
+
 def report(
     folders: Annotated[
         list[Path], typer.Argument(metavar="DIR...", help="Solution folders.", show_default=False)
@@ -25,7 +33,9 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", metavar="FILE", help="Page to write; by default report.html in the folder."
+            "--out",
+            metavar="FILE",
+            help="File to write; by default report.html or report.pdf in the folder.",
         ),
     ] = None,
     force: Force = False,
@@ -33,27 +43,47 @@ def report(
         bool,
         typer.Option("--redact", help="Leave out positions, names of trials and names of files."),
     ] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Write three pages of A4 to sign: report.pdf.")
+    ] = False,
+    language: Annotated[
+        ReportLanguage, typer.Option("--language", help="Language of the PDF.")
+    ] = ReportLanguage.ENGLISH,
 ) -> None:
     """Write the page of a result, or a page that compares several results.
 
     A page is one file that works offline. A cross-check in DIR/crosscheck and dead reckoning in
-    DIR/deadreckon are shown too.
+    DIR/deadreckon are shown too. `--pdf` writes the result for paper.
 
     Examples:
       factorgraph-dvl report out
+
+      factorgraph-dvl report out --pdf
 
       factorgraph-dvl report out-batch out-kalman --out comparison.html
     """
     from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.files.folders import write_file
-    from factorgraph_dvl.files.solution_folder import REPORT_FILE
+    from factorgraph_dvl.files.solution_folder import PDF_FILE, REPORT_FILE
+    from factorgraph_dvl.report.html.content import redact as redacted_result
     from factorgraph_dvl.report.html.page import comparison_page, report_page
+    from factorgraph_dvl.report.pdf.document import write_pdf
 
+    if pdf and len(folders) > 1:
+        raise ConfigError("--pdf shows one result", expected="one solution folder")
     if out is None and len(folders) > 1:
         raise ConfigError(
             "--out is missing", expected="the page to write, such as --out comparison.html"
         )
     results = [_load(folder) for folder in folders]
+    if pdf:
+        (shown,) = map(redacted_result, results) if redact else results
+        file = out or folders[0] / PDF_FILE
+        write_file(
+            file, lambda path: write_pdf(shown, path, language.value), force=force or out is None
+        )
+        print_file(file)
+        return
     if len(results) == 1:
         page = report_page(results[0], redacted=redact)
     else:
@@ -65,9 +95,15 @@ def report(
 
 
 def _load(folder: Path) -> Result:
-    """Return what a solution folder holds."""
+    """Return what a solution folder contains."""
     from factorgraph_dvl.files.run_file import read_run
-    from factorgraph_dvl.files.solution_folder import load_solution, read_halves, read_history
+    from factorgraph_dvl.files.solution_folder import (
+        CHECK_FILE,
+        load_solution,
+        read_check,
+        read_halves,
+        read_history,
+    )
     from factorgraph_dvl.report.html.content import Result
 
     run = read_run(folder)
@@ -79,6 +115,8 @@ def _load(folder: Path) -> Result:
         crosscheck=_read_json(folder / "crosscheck" / "crosscheck.json"),
         dead_reckoning=_read_json(folder / "deadreckon" / "deadreckon.json"),
         halves=read_halves(folder),
+        check=_read_json(folder / CHECK_FILE),
+        check_table=read_check(folder),
     )
 
 
@@ -115,14 +153,25 @@ def write_report(
 ) -> None:
     """Write run.json, and report.html; a page that fails is a warning: results are worth more."""
     from factorgraph_dvl.files.run_file import RUN_FILE, encode_run
-    from factorgraph_dvl.files.solution_folder import REPORT_FILE, read_halves
+    from factorgraph_dvl.files.solution_folder import (
+        CHECK_FILE,
+        REPORT_FILE,
+        read_check,
+        read_halves,
+    )
     from factorgraph_dvl.report.html.content import Result
     from factorgraph_dvl.report.html.page import report_page
 
     (folder / RUN_FILE).write_bytes(encode_run(run))
     try:
         result = Result(
-            as_text(name), solution, _builtins(run), history, halves=read_halves(folder)
+            as_text(name),
+            solution,
+            _builtins(run),
+            history,
+            halves=read_halves(folder),
+            check=_read_json(folder / CHECK_FILE),
+            check_table=read_check(folder),
         )
         (folder / REPORT_FILE).write_text(report_page(result), encoding="utf-8")
     except Exception as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from math import isfinite
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
+    from factorgraph_dvl.analysis.dead_reckoning.check import Check
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
     from factorgraph_dvl.solution import Solution
@@ -55,13 +57,15 @@ _ENTRIES = 500
 class _Found:
     """What a run found.
 
-    The solution, how a filter converged, the information along the trial, and its halves.
+    The solution, how a filter converged, the information along the trial, its halves, and what
+    the calibration does to residuals and dead reckoning.
     """
 
     solution: Solution
     history: History | None = None
     along: InformationHistory | None = None
     halves: Halves | None = None
+    check: Check | None = None
 
 
 class KalmanMethod(StrEnum):
@@ -122,7 +126,10 @@ def solve(
             trial, rate_hz=rate, entries=_ENTRIES, anyway=anyway, progress=progress
         )
         found = _Found(solution, along=along)
-        return found if parts is None else _with_halves(trial, found, parts, progress)
+        first: Solution | None = None
+        if parts is not None:
+            found, first = _with_halves(trial, found, parts, progress)
+        return replace(found, check=_checked(trial, solution, first, progress))
 
     _solve_into(
         out,
@@ -193,8 +200,8 @@ def kalman(
 
 def _with_halves(
     trial: Trial, found: _Found, parts: tuple[Trial, Trial], progress: ProgressLine
-) -> _Found:
-    """Return a solution with the difference of the trial's halves, if they can be solved."""
+) -> tuple[_Found, Solution | None]:
+    """Return a solution with the difference of the halves, and the first half's own."""
     from factorgraph_dvl.analysis.comparison.halves import compare_halves
     from factorgraph_dvl.errors import FactorgraphDvlError
     from factorgraph_dvl.message import message
@@ -206,10 +213,42 @@ def _with_halves(
     except FactorgraphDvlError as error:
         text = message("halves_differ.unsolved", error=str(error))
         note = Finding(Code.HALVES_DIFFER, text, severity="note")
-        return replace(found, solution=found.solution.with_findings((note,)))
+        return replace(found, solution=found.solution.with_findings((note,))), None
     halves = compare_halves(trial, first, second)
     solution = found.solution.with_findings(halves.findings())
-    return replace(found, solution=solution, halves=halves)
+    return replace(found, solution=solution, halves=halves), first
+
+
+def _checked(
+    trial: Trial, solution: Solution, first: Solution | None, progress: ProgressLine
+) -> Check | None:
+    """Return what the calibration does to the DVL's residuals and to dead reckoning.
+
+    The calibration of the first half is used with the data of the second. Where the first half
+    gives none to be used, the data are those that the calibration is from.
+    """
+    from factorgraph_dvl.analysis.comparison.halves import halves_of
+    from factorgraph_dvl.analysis.dead_reckoning.check import Data, check_calibration
+    from factorgraph_dvl.errors import FactorgraphDvlError
+    from factorgraph_dvl.estimates import values_of
+    from factorgraph_dvl.solvers.batch import solve as run_batch
+
+    if trial.log is None or trial.position_sensor is None:
+        return None
+
+    def half(stage: str, iteration: int, cost: float | None) -> None:
+        progress(f"first half: {stage}", iteration, cost)
+
+    candidates: list[tuple[Trial, Solution, Data]] = [(trial, solution, "same data")]
+    with suppress(FactorgraphDvlError):
+        start, rest = halves_of(trial)
+        first = first or run_batch(start, anyway=True, progress=half)
+        if first.verdict.grade != "do not use":
+            candidates.insert(0, (rest, first, "second half"))
+    for part, found, data in candidates:
+        with suppress(FactorgraphDvlError):
+            return check_calibration(part, solution, values_of(found.estimates), data)
+    return None
 
 
 def _solve_into(
@@ -226,6 +265,8 @@ def _solve_into(
     """Load a trial, run a solver, write and show its solution."""
     from factorgraph_dvl.files.run_file import run_of
     from factorgraph_dvl.files.solution_folder import (
+        CHECK_FILE,
+        CHECK_TABLE,
         FIGURES_FOLDER,
         HALVES_FILE,
         OWNED,
@@ -235,6 +276,7 @@ def _solve_into(
     )
     from factorgraph_dvl.files.tables import write_table
     from factorgraph_dvl.files.trial_folder import files_of, inputs_of, load_trial
+    from factorgraph_dvl.report.files.check import check_columns, check_json
     from factorgraph_dvl.report.html.content import maker_of
 
     claim_output(out, force=force, owned=OWNED, inputs=inputs_of(trial_path))
@@ -252,6 +294,9 @@ def _solve_into(
                 write_history(folder, along.time, along.names, along.std)
             if found.halves is not None:
                 write_table(folder / HALVES_FILE, found.halves.columns())
+            if found.check is not None:
+                (folder / CHECK_FILE).write_bytes(check_json(found.check))
+                write_table(folder / CHECK_TABLE, check_columns(found.check))
             write_instrument(solution, folder)
             shown = history or along
             run = run_of(trial, solution.steps, files_of(trial_path))

@@ -19,11 +19,10 @@ if TYPE_CHECKING:
     from factorgraph_dvl.solution import Solution
 
 
-def print_verdict(solution: Solution) -> None:
+def print_verdict(verdict: Verdict) -> None:
     """Print the verdict on one line, with its first reason and what to do about it."""
     from factorgraph_dvl.report.tables import verdict_line
 
-    verdict = solution.verdict
     if events.active():
         events.emit(events.Judged(verdict.grade, list(map(found_event, verdict.reasons))))
         return
@@ -45,12 +44,12 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     maker : str
         Maker of the DVL, empty if not known.
     page : Path
-        Of the result.
+        Page of the result.
     """
     from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
-    from factorgraph_dvl.report.entries import entries_table
+    from factorgraph_dvl.report.entries import entries_table, sum_with_compass
 
-    print_verdict(solution)
+    print_verdict(solution.verdict)
     reasons = solution.verdict.reasons[1:]
     if not events.active():
         for reason in reasons[: _REASONS - 1]:
@@ -59,6 +58,9 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
             count = len(reasons) + 1 - _REASONS
             stdout().print(f"Further reasons on the page: {count}", markup=False)
     if solution.verdict.grade != "do not use" and has_instrument_terms(solution):
+        both = sum_with_compass(solution.findings)
+        if both is not None and not events.active():
+            stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)
         print_table(entries_table(instrument_of(solution), maker), "unit")
     if not events.active():
         stdout().print(f"Open {page}", markup=False, soft_wrap=True)

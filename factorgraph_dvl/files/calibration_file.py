@@ -130,14 +130,14 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
     Parameters
     ----------
     path : path-like
-        Of the file, or of the solution folder that holds it.
+        Path of the file, or of the solution folder that contains it.
     body_axes : BodyAxes, default 'RFU'
-        That it is in where it does not say so.
+        Body axes that it is in where it does not say so.
 
     Raises
     ------
     DataError
-        If the file is missing or does not hold what it should.
+        If the file is missing or does not contain what it should.
 
     Examples
     --------

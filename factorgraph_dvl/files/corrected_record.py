@@ -47,9 +47,9 @@ def save_corrected(
     beams : DvlBeams
         The record.
     directions_b, scale_error, lever_arm : ndarray, shape (N, 3)
-        In body, (N,), (3,) m: the calibration.
+        Directions, scale error and lever arm in body, (N,), (3,) m: the calibration.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace what is there.
 
@@ -133,9 +133,9 @@ def save_corrected_dvl(
     dvl : Dvl
         The record.
     values : mapping of str to ndarray
-        As of `corrected_dvl`.
+        Values as of `corrected_dvl`.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace what is there.
 

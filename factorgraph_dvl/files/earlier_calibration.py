@@ -49,11 +49,11 @@ def with_earlier_calibrations(
     Parameters
     ----------
     imu, dvl : Imu or Dvl
-        Without them; None where the trial has none.
+        Records without them; None where the trial has none.
     folder : Path
-        That the names are relative to.
+        Folder that the names are relative to.
     body_axes, epoch : str
-        Of the trial.
+        Body axes and epoch of the trial.
     anyway : bool
         Take calibrations also if they are graded `do not use`.
 
@@ -115,11 +115,11 @@ def calibrated_by(
     Parameters
     ----------
     dvl : Dvl
-        Without a calibration.
+        DVL without a calibration.
     calibration : Calibration
-        Of the same DVL, mounted as it is now.
+        Calibration of the same DVL, mounted as it is now.
     body_axes : BodyAxes
-        Of the trial.
+        Body axes of the trial.
     source : str
         Name of the calibration, for messages.
     anyway : bool, default False
@@ -162,13 +162,13 @@ def with_biases_of(
     Parameters
     ----------
     imu : Imu
-        Without a calibration.
+        IMU without a calibration.
     calibration : Calibration
-        Of the same IMU, not switched off since.
+        Calibration of the same IMU, not switched off since.
     body_axes : BodyAxes
-        Of the trial.
+        Body axes of the trial.
     epoch : str
-        Of the trial; needed where biases walk.
+        Epoch of the trial; needed where biases walk.
     source : str
         Name of the calibration, for messages.
     with_dvl : bool, default False

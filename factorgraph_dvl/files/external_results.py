@@ -123,7 +123,7 @@ class _File(_Parameters, frozen=True, kw_only=True):
 
 
 def _file_type(text: str) -> type[_File]:
-    """Return the type of a file that may hold all parameters, and those of its beacons."""
+    """Return the type of a file that may contain all parameters, and those of its beacons."""
     names = [name for name in _KNOWN if name != offset_name(ANY_BEACON)]
     names += sorted({m[0] for m in BEACON_OFFSET.finditer(text)})
     fields: list[Any] = [(name, _Given, UNSET) for name in names]
@@ -156,7 +156,7 @@ def load_results(path_a: Path | str, path_b: Path | str) -> tuple[Solution, Solu
     Raises
     ------
     ConfigError, DataError
-        If there is no such result, or it does not hold what it should.
+        If there is no such result, or it does not contain what it should.
     """
     (a, a_says), (b, b_says) = _load(Path(path_a)), _load(Path(path_b))
     if not a_says:
@@ -203,7 +203,7 @@ def _load(path: Path) -> tuple[Solution, bool]:
 def load_truth(
     reference: Path | str | None, truth: Path | str | None
 ) -> tuple[Reference | None, dict[str, Array]]:
-    """Read what two results are to be held against.
+    """Read what two results are to be compared with.
 
     Parameters
     ----------
@@ -223,7 +223,7 @@ def load_truth(
     Raises
     ------
     ConfigError, DataError
-        If a file does not hold what it should, or the trial folder has neither.
+        If a file does not contain what it should, or the trial folder has neither.
     """
     motion: Reference | None = None
     values: dict[str, Array] = {}
@@ -248,7 +248,7 @@ def read_truth(path: Path | str) -> dict[str, Array]:
     Parameters
     ----------
     path : path-like
-        Of a JSON or YAML file, such as the `truth.json` of a trial folder.
+        Path of a JSON or YAML file, such as the `truth.json` of a trial folder.
 
     Returns
     -------
@@ -258,7 +258,7 @@ def read_truth(path: Path | str) -> dict[str, Array]:
     Raises
     ------
     ConfigError, DataError
-        If the file does not hold such values.
+        If the file does not contain such values.
     """
     path = Path(path)
     if path.suffix.lower() not in _TEXTS:
@@ -278,10 +278,10 @@ def read_calibration_values(
     Parameters
     ----------
     path : path-like
-        Of a calibration.json, of the solution folder that holds it, or of a JSON or YAML file of
-        calibration values.
+        Path of a calibration.json, of the solution folder with it, or of a JSON or YAML file
+        of calibration values.
     body_axes : BodyAxes
-        That the values must be in.
+        Body axes that the values must be in.
     anyway : bool, default False
         Read them also if they are graded `do not use`.
 
@@ -311,14 +311,14 @@ def read_calibration_values(
 
 
 def own_calibration(path: Path, body_axes: BodyAxes) -> Calibration | None:
-    """Read a calibration of this program; None if a file holds values typed in by hand.
+    """Read a calibration of this program; None if a file contains values typed in by hand.
 
     Parameters
     ----------
     path : path-like
-        As for `read_calibration_values`.
+        Path as for `read_calibration_values`.
     body_axes : BodyAxes
-        Of a file that does not state them.
+        Body axes of a file that does not state them.
     """
     whole = path.is_dir() or (
         path.suffix.lower() == ".json" and b'"covariance"' in read_calibration_bytes(path)

@@ -41,7 +41,7 @@ def write_file(path: Path, write: Callable[[Path], object], *, force: bool = Fal
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     write : callable of path-like, object
         Writes the file to a path of the same name, and others beside it.
     force : bool, default False
@@ -96,7 +96,7 @@ def claim(
     Parameters
     ----------
     path : path-like
-        Of the folder to be written.
+        Path of the folder to be written.
     force : bool, default False
         Replace what an earlier run wrote there.
     owned : sequence of str, optional
@@ -108,7 +108,7 @@ def claim(
     Raises
     ------
     DataError
-        If the folder holds inputs or, without `force`, anything; if another run is writing
+        If the folder contains inputs or, without `force`, anything; if another run is writing
         to it; if it is a link to itself; if it cannot be written or replaced.
     """
     target = real_path(path)
@@ -150,7 +150,7 @@ def new_folder(path: Path, *, force: bool = False, owned: Sequence[str] = ()) ->
     Parameters
     ----------
     path, force, owned : path-like, bool, sequence of str
-        As in `claim`.
+        Path, force and owned as in `claim`.
 
     Raises
     ------
@@ -201,7 +201,7 @@ def real_path(path: Path) -> Path:
 
 
 def _check_inputs(path: Path, target: Path, owned: Sequence[str], inputs: Iterable[Path]) -> None:
-    """Raise DataError if a folder holds a trial that is no result, or anything that is read."""
+    """Raise DataError if a folder contains a trial that is no result, or anything that is read."""
     if not target.is_dir():
         return
     if SETTINGS_FILE not in owned and (target / SETTINGS_FILE).exists():
@@ -267,7 +267,7 @@ def _check_place(path: Path, target: Path) -> None:
 
 
 def _check_content(path: Path, target: Path, force: bool, owned: Sequence[str]) -> None:
-    """Raise DataError if a folder holds what may not be replaced."""
+    """Raise DataError if a folder contains what may not be replaced."""
     if not target.is_dir() or not any(target.iterdir()):
         return
     if not force:

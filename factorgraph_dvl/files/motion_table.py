@@ -33,7 +33,7 @@ def read_reference(path: Path, source: str = "") -> Reference:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     source : str, optional
         Its name in messages.
 
@@ -46,7 +46,7 @@ def read_reference(path: Path, source: str = "") -> Reference:
 
 
 def reference_from(columns: Mapping[str, Array], source: str) -> Reference:
-    """Return the reference that columns hold, in the units of files.
+    """Return the reference that columns contain, in the units of files.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def read_motion(
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     source : str, optional
         Its name in messages.
     required, optional : sequence of str, sequence of sequence of str, optional
@@ -84,7 +84,7 @@ def read_motion(
 
 
 def as_trajectory(columns: Mapping[str, Array]) -> Trajectory:
-    """Return the trajectory that columns hold, with covariances that are diagonal."""
+    """Return the trajectory that columns contain, with covariances that are diagonal."""
     std = stack(columns, STD_COLUMNS) * np.repeat([1.0, 1.0, DEG], 3)
     covariances = np.zeros((len(std), 9, 3))
     covariances[:, np.arange(9), np.arange(9) % 3] = std**2

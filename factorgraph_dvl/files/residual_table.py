@@ -12,7 +12,9 @@ import numpy as np
 from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.tables import read_table
 
-_COLUMNS = ("time_s", "sensor", "component", "reason", "residual", "std", "unit")
+_COLUMNS = ("time_s", "sensor", "component", "residual", "std", "unit")
+# Why a measurement was rejected.
+_REASON = "reason"
 
 
 def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
@@ -21,7 +23,7 @@ def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
     Parameters
     ----------
     residuals : sequence of Residuals
-        At least one.
+        Residuals; at least one.
     """
     parts = []
     for r in residuals:
@@ -32,7 +34,6 @@ def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
                 np.repeat(r.time, len(r.components)),
                 np.full(size, r.label, dtype=object),
                 np.tile(np.array(r.components, dtype=object), r.time.size),
-                np.full(size, r.reason, dtype=object),
                 r.residual.ravel(),
                 r.sigma.ravel(),
                 np.full(size, r.unit, dtype=object),
@@ -47,9 +48,12 @@ def residual_columns(residuals: Sequence[Residuals]) -> dict[str, Any]:
 def rejected_columns(rejected: Sequence[Residuals]) -> dict[str, Any]:
     """Return rejected measurements as columns, by time, without what was not measured."""
     columns = residual_columns(rejected)
+    reasons = [np.full(r.residual.size, r.reason, dtype=object) for r in rejected]
+    columns = columns | {_REASON: np.concatenate(reasons)}
     order = np.argsort(columns["time_s"], kind="stable")
     order = order[np.isfinite(columns["residual"][order])]
-    return {name: values[order] for name, values in columns.items()}
+    names = (*_COLUMNS[:3], _REASON, *_COLUMNS[3:])
+    return {name: columns[name][order] for name in names}
 
 
 def read_residuals(path: Path) -> tuple[Residuals, ...]:
@@ -62,9 +66,12 @@ def read_residuals(path: Path) -> tuple[Residuals, ...]:
     """
     if not os.path.lexists(path):
         return ()
-    columns = read_table(path, _COLUMNS, source=str(path))
+    columns = read_table(path, _COLUMNS, [(_REASON,)], source=str(path))
+    if columns[_REASON].dtype.kind == "f":
+        # Measurements that were used have none.
+        columns[_REASON] = np.full(columns["sensor"].size, Residuals.reason)
     _, first, group = np.unique(
-        np.char.add(np.char.add(columns["sensor"], "\n"), columns["reason"]),
+        np.char.add(np.char.add(columns["sensor"], "\n"), columns[_REASON]),
         return_index=True,
         return_inverse=True,
     )
@@ -98,5 +105,5 @@ def _group(columns: dict[str, Any]) -> Residuals:
         time=time[key // (repeat.max() + 1)],
         residual=residual,
         sigma=sigma,
-        reason=str(columns["reason"][0]),
+        reason=str(columns[_REASON][0]),
     )

@@ -30,7 +30,7 @@ _PACKAGES = ("factorgraph-dvl", "gtsam", "numpy", "scipy")
 
 
 class Inventory(msgspec.Struct):
-    """What the record of one sensor holds."""
+    """What the record of one sensor contains."""
 
     sensor: str
     rows: int

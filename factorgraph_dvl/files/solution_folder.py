@@ -47,7 +47,20 @@ INSTRUMENT_FILE = "instrument.yaml"
 BEAMS_FILE = "beams.csv"
 BEAM_ANGLES_FILE = "beam_angles.csv"
 HALVES_FILE = "halves.csv"
+CHECK_FILE = "check.json"
+CHECK_TABLE = "check.parquet"
+# Residuals of the DVL, and errors of dead reckoning, before and after calibration.
+CHECK_COLUMNS = (
+    "time_s",
+    *(
+        f"residual_{axis}_{when}_m_s"
+        for when in ("before", "after")
+        for axis in ("forward", "starboard", "down")
+    ),
+)
+CHECK_ERRORS = ("track_error_before_m", "track_error_after_m")
 REPORT_FILE = "report.html"
+PDF_FILE = "report.pdf"
 # Of trajectories that were exported, before the name of their format.
 EXPORT_STEM = "trajectory"
 FIGURES_FOLDER = "figures"
@@ -55,8 +68,8 @@ FIGURES_FOLDER = "figures"
 OWNED = (
     *(CALIBRATION_FILE, TRAJECTORY_FILE, HISTORY_FILE, LATENCY_FILE, CONVERGENCE_FILE),
     *(HYPOTHESES_FILE, f"{HYPOTHESES_FOLDER}/[0-9]*.csv", REJECTED_FILE, RESIDUALS_FILE),
-    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE),
-    *(RUN_FILE, REPORT_FILE),
+    *(INSTRUMENT_FILE, BEAMS_FILE, BEAM_ANGLES_FILE, HALVES_FILE, CHECK_FILE, CHECK_TABLE),
+    *(RUN_FILE, REPORT_FILE, PDF_FILE),
     *(
         f"{EXPORT_STEM}.{name}"
         for name in (
@@ -101,9 +114,9 @@ def save_solution(
     Parameters
     ----------
     solution : Solution
-        To write.
+        Solution to write.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace the solution that is there.
     extra : callable, optional
@@ -114,7 +127,7 @@ def save_solution(
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set; if it holds a trial.
+        If the folder exists, is not empty, and `force` is not set; if it contains a trial.
 
     Examples
     --------
@@ -171,11 +184,11 @@ def write_history(
     Parameters
     ----------
     folder : path-like
-        To write into.
+        Folder to write into.
     time : ndarray, shape (H,), s
-        Of the updates.
+        Times of the updates.
     names : sequence of str
-        Of the n components, as in `covariance.order`.
+        Names of the n components, as in `covariance.order`.
     std : ndarray, shape (H, n)
         Standard deviations, in reported units.
     values : ndarray, shape (H, n), optional
@@ -199,7 +212,7 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
     Parameters
     ----------
     folder : path-like
-        To write into.
+        Folder to write into.
     time, latency : ndarray, shape (H,), s
         When the updates came, and how long each took.
     solved : ndarray, shape (H,)
@@ -212,18 +225,18 @@ def write_latency(folder: Path, time: Array, latency: Array, solved: np.ndarray)
 def load_solution(path: Path | str) -> Solution:
     """Read a solution folder.
 
-    The files hold the diagonals of the trajectory's covariances: what is loaded has zeros
+    The files contain the diagonals of the trajectory's covariances: what is loaded has zeros
     elsewhere. Residuals are those of `residuals.parquet` and `rejected.csv`, where they exist.
 
     Parameters
     ----------
     path : path-like
-        Of the folder.
+        Path of the folder.
 
     Raises
     ------
     DataError
-        If a file is missing or does not hold what it should.
+        If a file is missing or does not contain what it should.
 
     Examples
     --------
@@ -258,7 +271,7 @@ def read_history(path: Path) -> tuple[Array, tuple[str, ...], Array] | None:
     Raises
     ------
     DataError
-        If it does not hold what it should.
+        If it does not contain what it should.
     """
     file = path / HISTORY_FILE
     if not os.path.lexists(file):
@@ -275,10 +288,24 @@ def read_halves(path: Path) -> dict[str, Any]:
     Raises
     ------
     DataError
-        If it does not hold what it should.
+        If it does not contain what it should.
     """
     file = path / HALVES_FILE
     return read_table(file, read_header(file), source=str(file)) if os.path.lexists(file) else {}
+
+
+def read_check(path: Path) -> dict[str, Any]:
+    """Return the columns of check.parquet; nothing where there is no such file.
+
+    Raises
+    ------
+    DataError
+        If it does not contain what it should.
+    """
+    file = path / CHECK_TABLE
+    if not os.path.lexists(file):
+        return {}
+    return read_table(file, CHECK_COLUMNS, [CHECK_ERRORS], source=str(file))
 
 
 def trajectory_columns(trajectory: Trajectory) -> dict[str, Array]:

@@ -38,12 +38,12 @@ def read_table(
 ) -> dict[str, Any]:
     """Read columns of numbers from a CSV or, by its suffix, a Parquet file.
 
-    Those in `TEXT` hold text.
+    Those in `TEXT` contain text.
 
     Parameters
     ----------
     path : path-like
-        Of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
+        Path of the file. A CSV has one header line; a cell that is empty or `nan` is nan.
     required : sequence of str
         Columns that must be there. Others than those asked for are not read.
     optional : sequence of sequence of str, optional
@@ -98,14 +98,14 @@ def columns_of(
     table : mapping of str to array_like, or DataFrame
         Whatever has columns by name.
     required, optional : sequence of str, sequence of sequence of str
-        As of `read_table`.
+        Columns as of `read_table`.
     source : str
         Name of the table in messages.
 
     Raises
     ------
     DataError
-        If a column is missing, holds no numbers, or differs in length from the others.
+        If a column is missing, contains no numbers, or differs in length from the others.
     """
     header = [str(name) for name in table]
     names = _choose(header, required, optional, source)
@@ -207,7 +207,7 @@ class TableWriter:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     """
 
     def __init__(self, path: Path) -> None:

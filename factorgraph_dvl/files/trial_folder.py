@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import UNSET
 
 from factorgraph_dvl.errors import ConfigError, DataError, FactorgraphDvlError, printable
+from factorgraph_dvl.files.calibration_file import CALIBRATION_FILE
 from factorgraph_dvl.files.earlier_calibration import save_prior, with_earlier_calibrations
 from factorgraph_dvl.files.folders import SETTINGS_FILE, new_folder
 from factorgraph_dvl.files.initial_conditions import (
@@ -82,7 +83,7 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     Parameters
     ----------
     path : path-like
-        Of the folder, or of the trial.yaml in it.
+        Path of the folder, or of the trial.yaml in it.
     anyway : bool, default False
         Start from the calibrations in `dvl.calibration` and `imu.calibration` also if they are
         graded `do not use`; the trial notes it.
@@ -90,10 +91,10 @@ def load_trial(path: Path | str, *, anyway: bool = False) -> Trial:
     Raises
     ------
     ConfigError
-        If trial.yaml is missing or holds a key that is unknown, missing, of the wrong
+        If trial.yaml is missing or contains a key that is unknown, missing, of the wrong
         type or out of range.
     DataError
-        If a table is missing or does not hold what it should.
+        If a table is missing or does not contain what it should.
 
     Examples
     --------
@@ -117,13 +118,13 @@ def assembled(
     Parameters
     ----------
     settings : TrialSettings
-        As in trial.yaml.
+        Settings as in trial.yaml.
     tables : Path or mapping of str to mapping
         Folder with the tables of the sensors, or the tables by section.
     folder : Path
         Where `dvl.calibration` is looked for.
     anyway : bool, default False
-        As of `load_trial`.
+        Option as of `load_trial`.
     """
     initial = settings.initial
     kinds = {aid.section: aid for aid in aid_types()}
@@ -172,7 +173,7 @@ def load_reference(path: Path | str) -> tuple[Reference | None, dict[str, Array]
     Parameters
     ----------
     path : path-like
-        Of the folder, or of the trial.yaml in it.
+        Path of the folder, or of the trial.yaml in it.
 
     Returns
     -------
@@ -218,21 +219,21 @@ def save_trial(
     Parameters
     ----------
     trial : Trial
-        To write.
+        Trial to write.
     path : path-like
-        Of the folder.
+        Path of the folder.
     force : bool, default False
         Replace a trial that `save_trial` or `simulate` wrote; never another one, whose tables may
         be the only ones.
     parquet : bool, default False
         Write the sensors' tables as Parquet.
     seed : int, optional
-        Of a trial that was simulated: trial.yaml says so.
+        Seed of a trial that was simulated: trial.yaml says so.
 
     Raises
     ------
     DataError
-        If the folder exists, is not empty, and `force` is not set, or holds a trial that was
+        If the folder exists, is not empty, and `force` is not set, or contains a trial that was
         written otherwise.
 
     Examples
@@ -274,7 +275,7 @@ def _write_settings(folder: Path, settings: TrialSettings, seed: int | None) -> 
 
 
 def check_simulated(path: Path) -> None:
-    """Raise DataError if a folder holds a trial that was not written by `simulate`."""
+    """Raise DataError if a folder contains a trial that was not written by `simulate`."""
     _check_written(path, "simulate", (_SIMULATED,))
 
 
@@ -329,12 +330,38 @@ def _share_pings(dvl: Dvl, others: dict[str, Aid]) -> bool:
     return beams is not None and bool(np.mean(np.isin(beams.time, dvl.time)) > 0.5)
 
 
+_IMPORT = "Make one of files of instruments with: factorgraph-dvl import FILE… --out TRIAL"
+
+
 def locate(path: Path) -> tuple[Path, Path]:
     """Return a trial's folder and its trial.yaml."""
     if not path.exists():
         raise DataError("the trial does not exist", where=str(path), expected="a trial folder")
-    file = path / SETTINGS_FILE if path.is_dir() else path
-    return file.parent, file
+    if not path.is_dir():
+        if path.suffix.lower() not in (".yaml", ".yml"):
+            raise DataError(
+                "not a trial",
+                where=str(path),
+                expected=f"a trial folder, or the {SETTINGS_FILE} in it",
+                hint=_IMPORT,
+            )
+        return path.parent, path
+    file = path / SETTINGS_FILE
+    if not file.exists():
+        if (path / CALIBRATION_FILE).exists():
+            raise DataError(
+                "the folder of a result, not of a trial",
+                where=str(path),
+                expected=f"a folder with {SETTINGS_FILE}",
+                hint="Show a result with: factorgraph-dvl report DIR",
+            )
+        raise DataError(
+            f"the folder has no {SETTINGS_FILE}",
+            where=str(path),
+            expected="a trial folder",
+            hint=_IMPORT,
+        )
+    return path, file
 
 
 def _reference_of(tables: Path | Tables, settings: TrialSettings) -> Reference | None:

@@ -38,7 +38,7 @@ def trial_from_tables(
     ConfigError
         If a key is unknown, missing, of the wrong type or out of range, or a section has no table.
     DataError
-        If a table does not hold what it should.
+        If a table does not contain what it should.
 
     Examples
     --------

@@ -102,7 +102,7 @@ def attitudes_from_vectors(
     R : ndarray, shape (M, 3, 3)
         Rotations.
     P : ndarray, shape (M, 3, 3)
-        As above.
+        Covariance as above.
     """
     moments = np.add.reduceat(catalogue[:, :, None] * measured[:, None, :], first)
     across = np.eye(3) - measured[:, :, None] * measured[:, None, :]
@@ -129,11 +129,11 @@ def off_vertical(time: Array, nRb: Array, force_time: Array, force: Array) -> fl
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the attitudes.
+        Times of the attitudes.
     nRb : ndarray, shape (M, 3, 3)
         Body to east, north, up.
     force_time : ndarray, shape (N,), s
-        Of the specific force.
+        Times of the specific force.
     force : ndarray, shape (N, 3), m/s²
         Specific force in body.
     """

@@ -181,7 +181,7 @@ class ArcPolynomials:
         """Return the first sample, within the arc, of the stencils of intervals `inside` it.
 
         Centred, unless the rate is rougher there than noise explains: then the smoothest
-        stencil that still holds the interval.
+        stencil that still contains the interval.
         """
         stencil = np.minimum(np.maximum(inside - 2, 0), most)
         roughness = self._roughness[base + stencil]
@@ -240,7 +240,7 @@ def open_steps(arcs: ArcPolynomials, noise: Array) -> Array:
 
     Two instantaneous samples do not show when between them a signal stepped from the one
     value to the other: the mean is uniform between the two. A step shows as an interval
-    that is rough in every stencil that holds it, while the stencils beside it are smooth.
+    that is rough in every stencil that contains it, while the stencils beside it are smooth.
 
     Parameters
     ----------

@@ -52,11 +52,11 @@ class AttitudeHistory:
     Parameters
     ----------
     imu : Imu
-        Whose gyros carry the attitude between the epochs.
+        IMU whose gyros carry the attitude between the epochs.
     motion : Trajectory or Reference
         The source; its roll, pitch, heading and latitude are used.
     body_axes : BodyAxes
-        Of the body.
+        Axes of the body.
     gyro_bias : ndarray, shape (3,), rad/s
         Zero if not known: through a lever arm of 1 m, 10 deg/h are 0.05 mm/s.
 

@@ -37,9 +37,9 @@ class BodyAttitude:
     Parameters
     ----------
     rph : ndarray, shape (M, 3), rad
-        As it was measured.
+        Roll, pitch and heading as they were measured.
     nRb : ndarray, shape (M, 3, 3)
-        Without its errors.
+        Attitude without its errors.
     omega_eb_b, alpha_b : ndarray, shape (M, 3)
         Rate, rad/s, and its derivative.
     omega_sigma : ndarray, shape (M, 3), rad/s

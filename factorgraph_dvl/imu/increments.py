@@ -300,7 +300,7 @@ def increments(
     Returns
     -------
     increments : Increments
-        Of all arcs.
+        Increments of all arcs.
     findings : tuple of Finding
         What was lost, filled or left out.
 
@@ -355,9 +355,9 @@ def unbroken_increments(
     Parameters
     ----------
     settings : ImuSettings
-        Of the IMU.
+        Settings of the IMU.
     time : ndarray, shape (S,), s
-        Of the samples, `_LEAST` at least.
+        Times of the samples, `_LEAST` at least.
     rate, force : ndarray, shape (S, 3)
         The samples.
     windows : tuple of (int, int)

@@ -83,7 +83,7 @@ def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
     Parameters
     ----------
     imu : Imu
-        With stated noise; where the record's bound is larger, it takes its place.
+        IMU with stated noise; where the record's bound is larger, it takes its place.
     """
     stated = (imu.settings.gyro_noise_root_psd, imu.settings.accel_noise_root_psd)
     found = white_noise(imu, stretches=_FIRST_LOOK)

@@ -125,9 +125,9 @@ class Segments:
     Parameters
     ----------
     increments : Increments
-        Of all arcs.
+        Increments of all arcs.
     node_time : ndarray, shape (K,), s
-        Of the nodes.
+        Times of the nodes.
     first, last : ndarray of int, shape (S,)
         First and last-plus-one interval of each segment.
     origin : ndarray of int, shape (S,)
@@ -139,10 +139,10 @@ class Segments:
     knots : Integrals
         T of them: at the start of each segment, and of every `spacing`-th interval from there on.
     less : ndarray, shape (T, 3), m
-        By how much less far each knot would lead to the next with a force that turns with the body
-        within a sample, as GTSAM has it.
+        Distance by which each knot would lead less far to the next with a force that turns with
+        the body within a sample, as GTSAM has it.
     ends : Integrals
-        At the ends of the S segments.
+        Integrals at the ends of the S segments.
     """
 
     increments: Increments
@@ -602,7 +602,7 @@ def _by_stride(seg: Segments, block: slice) -> tuple[IntArray, Array, Array, Arr
     rate, force : ndarray, shape (T, 3)
         Constant over each step.
     duration : ndarray, shape (T,), s
-        Of each step.
+        Duration of each step.
     """
     strides = seg.strides(block)
     h = 0.5 * strides.duration[:, None]

@@ -43,7 +43,7 @@ class States:
 
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """Where M measurement times hang on the chain, and the increments up to them.
+    """Where M measurement times are attached to the chain, and the increments up to them.
 
     Parameters
     ----------
@@ -204,9 +204,9 @@ class Transition:
     at : Attachment
         Attachment of the M times.
     states : States
-        At the nodes.
+        States at the nodes.
     motion : Motion
-        At the times.
+        Motion at the times.
     earth_rate_n : ndarray, shape (3,), rad/s
         Earth rate in n.
     increments : tuple of ndarray, optional
@@ -282,7 +282,7 @@ def motion_at(
     at : Attachment
         Attachment of M times.
     states : States
-        At the K nodes.
+        States at the K nodes.
     gravity_n : ndarray, shape (S, 3)
         `LocalFrame.gravity_without_rotation` along the segments, m/s².
     earth_rate_n : ndarray, shape (3,), rad/s

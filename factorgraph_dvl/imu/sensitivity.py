@@ -36,8 +36,8 @@ class Sensitivity:
     Parameters
     ----------
     theta, v, p : ndarray, shape (M, 3, n)
-        Of rotation, velocity and position increments: -Theta, V, P, in the axes at the
-        segment's start.
+        Increments of rotation, velocity and position: -Theta, V, P, in the axes at the segment's
+        start.
     gyro, force : ndarray, shape (M, 3)
         Rate and force at the times, of which E and A consist; at the ends of segments zero.
     """
@@ -86,14 +86,14 @@ def sensitivities(
     errors : sequence of ImuError
         The n errors.
     attachments : sequence of Attachment
-        Where measurements hang on the chain.
+        Where measurements are attached to the chain.
 
     Returns
     -------
     ends : Sensitivity
-        Of the increments over the S segments.
+        Sensitivity of the increments over the S segments.
     attached : list of Sensitivity
-        Of the motion that is attached.
+        Attachment of the motion that is attached.
     """
     n = len(errors)
     whole = _zeros(seg.first.size, n)
@@ -175,9 +175,9 @@ def carried_back_by(at: TwoWay, forward: Sensitivity, ends: Sensitivity) -> Sens
     Parameters
     ----------
     at : TwoWay
-        Where M times hang on the chain.
+        Where M times are attached to the chain.
     forward : Sensitivity
-        Of what is integrated up to the times.
+        Increments of what is integrated up to the times.
     ends : Sensitivity
         The same up to the ends of all segments.
     """
@@ -206,15 +206,15 @@ def corrected_two_way(
     Parameters
     ----------
     at : TwoWay
-        Where M times hang on the chain.
+        Where M times are attached to the chain.
     by, ends : Sensitivity
-        As `forward` and `ends` of `carried_back_by`.
+        Sensitivities as `forward` and `ends` of `carried_back_by`.
     seg : Segments
         Increments between the nodes.
     errors : sequence of ImuError
         The n errors.
     sizes : ndarray, shape (n,)
-        Of them.
+        Sizes of the variables.
     """
     forward = corrected(at.forward, by, errors, sizes)
     whole = Integrals(
@@ -256,9 +256,9 @@ def by_errors(
     lin : Linearization
         Derivatives with respect to the motion at the M times.
     transition : Transition
-        From the nodes to these times.
+        Transition from the nodes to these times.
     by : Sensitivity
-        Of the motion.
+        Derivative of the motion.
     errors : sequence of ImuError
         The n errors.
     """

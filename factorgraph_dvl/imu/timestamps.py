@@ -85,7 +85,7 @@ def unrounded(time: Array, number: Array | None = None) -> Array:
     time : ndarray, shape (N,), s
         Stamps of the samples.
     number : ndarray, shape (N,), optional
-        Of the samples, lost ones counted; None = none was lost.
+        Number of the samples, lost ones counted; None = none was lost.
     """
     count = np.arange(time.size) if number is None else number
     count = count - count.mean()

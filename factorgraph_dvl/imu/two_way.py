@@ -33,12 +33,13 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 @dataclass(frozen=True, eq=False)
 class TwoWay:
-    """Where M times hang on both nodes of their segments.
+    """Where M times are attached to both nodes of their segments.
 
     Parameters
     ----------
     forward, backward : Attachment
-        To the node before, and to the node after: its times and increments are negative.
+        Attachments to the node before, and to the node after: its times and increments are
+        negative.
     share, share_rate : ndarray, shape (M,)
         Share s of the motion carried back, and its time derivative, 1/s.
     bend : ndarray, shape (M,), s
@@ -74,9 +75,9 @@ class TwoWayTransition:
     at : TwoWay
         Attachment of the times.
     motion : Motion
-        At the times.
+        Motion at the times.
     forward, backward : Transition
-        Of the motions carried from either.
+        Values of the motions carried from either.
     """
 
     at: TwoWay
@@ -88,7 +89,7 @@ class TwoWayTransition:
 def attach_two_way(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
     """Attach times (M,) to both nodes of their segments; those not covered, where nearest.
 
-    Times that something still hangs on are not attached anew.
+    Times that something is still attached to are not attached anew.
     """
     known = vars(seg).setdefault("_attached", WeakValueDictionary())
     key = time.tobytes(), earth_rate_n.tobytes()
@@ -124,9 +125,9 @@ def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Att
     ends : Integrals
         Over all S segments.
     forward : Attachment
-        Of M times to the nodes before.
+        Attachment of M times to the nodes before.
     place : Attachment
-        To the nodes after, with any increments.
+        Place to the nodes after, with any increments.
     """
     whole = rows_of(ends, forward.segment)
     back = np.ascontiguousarray(whole.dR.transpose(0, 2, 1))

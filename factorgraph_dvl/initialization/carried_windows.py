@@ -35,11 +35,11 @@ class CarriedWindows:
     start : ndarray, shape (W,), s
         Where the windows begin, margins left out.
     length : float
-        Of a window, margins left out, s.
+        Length of a window, margins left out, s.
     begin : ndarray, shape (W,), s
         Time of the first sample, margin included.
     step : float
-        Between samples, s.
+        Step between samples, s.
     turn : ndarray, shape (W, K, 3, 3)
         Body to body at the start.
     speed, place : ndarray, shape (W, K, 3)

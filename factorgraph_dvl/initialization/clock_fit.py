@@ -76,11 +76,11 @@ class ClockFit:
     inflation : float
         Variance of the last parameter over what white noise would make it.
     misfits : ndarray, shape (W,)
-        As of `window_misfits`.
+        Misfits as of `window_misfits`.
     residual : ndarray, shape (W, n, 3), m/s
         What is left.
     score, information : ndarray, shape (W, n)
-        Of the offset at each measurement.
+        Score and information of the offset at each measurement.
     """
 
     values: Array
@@ -112,9 +112,9 @@ def fit_clock(comparison: Comparison, design: Array, start: Array) -> ClockFit:
     Parameters
     ----------
     comparison : Comparison
-        Of W windows of n measurements.
+        Comparison of W windows of n measurements.
     design : ndarray, shape (W, n, c)
-        From clock parameters to offsets, s.
+        Design from clock parameters to offsets, s.
     start : ndarray, shape (c,)
         Parameters to start from.
     """
@@ -187,11 +187,11 @@ def _score_covariance(
     Parameters
     ----------
     comparison : Comparison
-        Of W windows of n measurements.
+        Comparison of W windows of n measurements.
     residual, slope : ndarray, shape (W, n, 3)
-        Of unit noise, and derivative by the offset.
+        Residual of unit noise, and its derivative by the offset.
     design : ndarray, shape (W, n, c)
-        From clock parameters to offsets.
+        Design from clock parameters to offsets.
     """
     power = np.sum(np.abs(np.fft.fft(residual, axis=1)) ** 2, axis=(0, 2))
     power /= 3.0 * comparison.inside.sum()

@@ -82,7 +82,7 @@ class ClockOffset:
     Parameters
     ----------
     offset, sigma : float, s
-        At `middle`; before the jump if there is one.
+        Offset and sigma at `middle`; before the jump if there is one.
     rate, rate_sigma : float
         Rate and its standard deviation, s/s; 0 where a rate is not certain.
     jump, jump_sigma : float, s
@@ -90,7 +90,7 @@ class ClockOffset:
     jump_time : float, s
         When; nan if never.
     middle : float, s
-        Time at which the offset holds.
+        Time at which the offset is valid.
     gain : float
         Log-likelihood that it gains against an offset `around`, its noise correlated as it is.
     unexplained : float
@@ -122,11 +122,11 @@ def clock_offset(
     Parameters
     ----------
     comparison : Comparison
-        Of the sensor with the carried IMU.
+        Comparison of the sensor with the carried IMU.
     around : float
         Middle of the scan, s.
     reach : float
-        Of the scan to both sides, s.
+        Reach of the scan to both sides, s.
 
     Returns
     -------

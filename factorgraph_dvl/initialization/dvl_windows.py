@@ -47,8 +47,8 @@ class DvlFit:
     Parameters
     ----------
     residual : ndarray, shape (W, n, 3), m/s
-        Of the DVL's velocity, in the axes of the window's start, polynomial taken out; 0 where
-        there is none.
+        Residual of the DVL's velocity, in the axes of the window's start, polynomial taken out; 0
+        where there is none.
     dRb : ndarray, shape (3, 3)
         Body to DVL; of determinant -1 where the axes are mirrored.
     scale_error : float
@@ -70,7 +70,7 @@ class DvlWindows(VelocityWindows):
     Parameters
     ----------
     handedness : {0, 1, -1}
-        Of the DVL's axes: 1 right-handed, -1 mirrored, 0 whichever fits better.
+        Handedness of the DVL's axes: 1 right-handed, -1 mirrored, 0 whichever fits better.
     later : float, s
         Offset of its clock around which others are tried.
     """

@@ -103,7 +103,7 @@ class WindowFit:
     arm_error : ndarray, shape (3,), m
         Lever arm of the antenna in body, less the stated one.
     arm_covariance : ndarray, shape (3, 3), m²
-        By the residuals.
+        Covariance of the lever arm by the residuals.
     """
 
     residual: Array

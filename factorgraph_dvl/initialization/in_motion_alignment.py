@@ -71,9 +71,9 @@ class AlignedStates:
     Parameters
     ----------
     states : States
-        At the nodes.
+        States at the nodes.
     mountings : dict of str to ndarray
-        By parameter name, sRb of sensors of attitude where the gyros determine it.
+        Mountings by parameter name, sRb of sensors of attitude where the gyros determine it.
     findings : tuple of Finding
         What the user must know of how they were found.
     """

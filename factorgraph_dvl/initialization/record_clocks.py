@@ -46,7 +46,7 @@ def clock_lags(
     time : ndarray, shape (M,), s
         Stamps of pings.
     velocity : ndarray, shape (M, 3), m/s
-        Of the pings, in axes of the DVL.
+        Velocity of the pings, in axes of the DVL.
     motion_at : callable
         Returns the motion at true times (M,), s, if stamps of the attitude are late by so many
         seconds, and at which of them it is known.

@@ -212,7 +212,7 @@ def _white_noise(recorded: Trial, exact: Trial) -> dict[str, Array]:
     Parameters
     ----------
     recorded, exact : Trial
-        With noise and without.
+        Trials with noise and without.
     """
     frame, axes = exact.frame(), exact.body_axes
     out = {}

@@ -42,9 +42,9 @@ def clock_findings(
     Parameters
     ----------
     sensor : Gnss, Dvl or DvlBeams
-        Whose clock it is; its settings say what is known of it.
+        Sensor whose clock it is; its settings say what is known of it.
     clock : ClockOffset
-        As found.
+        Clock as found.
     span : float
         Length of its record, s.
     """

@@ -332,7 +332,7 @@ class _DvlView(_View[DvlWindows]):
         return self.compared.handedness < 0
 
     def believed_beside(self, right: _DvlView) -> bool:
-        """Whether these axes, mirrored, are believed rather than right-handed ones.
+        """Whether these axes, mirrored, are accepted rather than right-handed ones.
 
         Sway repeats itself: with a clock that is off by half a period the other axes fit nearly.
         """

@@ -173,7 +173,7 @@ def mirrored_finding(dvl: Dvl, fit: DvlFit) -> Finding:
     dvl : Dvl
         Record of the DVL.
     fit : DvlFit
-        Of its pings to the carried IMU, with mirrored axes.
+        Fit of its pings to the carried IMU, with mirrored axes.
     """
     prior = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
     explained = []

@@ -65,11 +65,11 @@ def prior_against_data(
     prior : ndarray, shape (n,)
         Mean of the prior.
     prior_covariance : ndarray, shape (n, n)
-        Of the prior.
+        Covariance of the prior.
     value : ndarray, shape (n,)
         Mean with the data.
     covariance : ndarray, shape (n, n)
-        With the data.
+        Covariance with the data.
     """
     scale = np.sqrt(np.maximum(np.diag(prior_covariance), 0.0))
     scale = np.where(scale > 0.0, scale, 1.0)

@@ -35,7 +35,7 @@ def planar_findings(trial: Trial, sensors: Sequence[SensorSurvey]) -> Iterator[F
     Parameters
     ----------
     trial : Trial
-        With compass, log, depth and beacons.
+        Trial with compass, log, depth and beacons.
     sensors : sequence of SensorSurvey
         Its records.
     """

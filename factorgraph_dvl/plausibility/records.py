@@ -25,7 +25,7 @@ class SensorSurvey:
     Parameters
     ----------
     label : str
-        Of the sensor.
+        Label of the sensor.
     rate : float
         Median, Hz; nan for a single sample.
     samples : int
@@ -56,9 +56,9 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
     Parameters
     ----------
     label : str
-        Of the sensor.
+        Label of the sensor.
     time : ndarray, shape (N,), s
-        Of the rows.
+        Times of the rows.
     missing : ndarray of bool, shape (N,)
         Rows without a measurement.
     """

@@ -45,7 +45,7 @@ def star_findings(star: Star, trial: Trial) -> Iterator[Finding]:
 
 
 def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
-    """Hold the vertical by the stars against that of the specific force."""
+    """Compare the vertical by the stars with that of the specific force."""
     unknown = max(star.settings.mounting_std_deg) > _KNOWN_MOUNTING_DEG
     if unknown or (trial.gnss is None and trial.initial_position is None):
         return
@@ -66,7 +66,7 @@ def _vertical(star: Star, trial: Trial) -> Iterator[Finding]:
 
 
 def _convention(star: Star, imu: Imu) -> Iterator[Finding]:
-    """Hold the turns between attitudes against those of the gyros."""
+    """Compare the turns between attitudes with those of the gyros."""
     if max(star.settings.mounting_std_deg) > 30.0:
         return
     known = np.logical_not(star.missing)

@@ -1,4 +1,4 @@
-"""What a trial holds, and what is implausible about it: errors refuse it."""
+"""What a trial contains, and what is implausible about it: errors refuse it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def findings(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Finding]:
     Parameters
     ----------
     trial : Trial
-        As loaded.
+        Trial as loaded.
     sensors : list of SensorSurvey
         Its records, that of the IMU first.
     """
@@ -73,7 +73,7 @@ def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Fi
 
 @dataclass(frozen=True)
 class Survey:
-    """What a trial holds.
+    """What a trial contains.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class Survey:
     sensors : tuple of SensorSurvey
         One entry for each.
     duration : float
-        Of the record of the IMU, or of what takes its place, s.
+        Duration of the record of the IMU, or of what takes its place, s.
     distance : float
         Travelled, m; nan without GNSS, DVL and log.
     speed_min, speed_max : float
@@ -116,7 +116,7 @@ def survey(trial: Trial) -> Survey:
     Parameters
     ----------
     trial : Trial
-        As loaded.
+        Trial as loaded.
 
     Examples
     --------
@@ -152,7 +152,7 @@ def accepted_errors(found: Survey, *, anyway: bool) -> tuple[Finding, ...]:
     Parameters
     ----------
     found : Survey
-        Of the trial.
+        Survey of the trial.
     anyway : bool
         Accept all of them.
 

@@ -48,9 +48,9 @@ def without_invalid_values(
     Parameters
     ----------
     section : str
-        Of trial.yaml.
+        Section of trial.yaml.
     columns : mapping of str to ndarray, shape (M,)
-        As read; left as they are.
+        Columns as read; left as they are.
     source : str
         Name of the file, for messages.
     """

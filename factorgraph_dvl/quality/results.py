@@ -171,7 +171,7 @@ def contradictions(residuals: Sequence[Residuals]) -> list[Finding]:
     Parameters
     ----------
     residuals : sequence of Residuals
-        With standard deviations that include those of the states, or innovations.
+        Residuals with standard deviations that include those of the states, or innovations.
     """
     out = []
     for r in residuals:

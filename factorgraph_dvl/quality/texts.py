@@ -93,7 +93,7 @@ def decoded(data: Any, text: str) -> Message | str:
     Parameters
     ----------
     data : object
-        As read from JSON.
+        Data as read from JSON.
     text : str
         The sentence in English beside it.
     """
@@ -137,7 +137,7 @@ def component_names(component: str) -> tuple[str, str, str]:
     Parameters
     ----------
     component : str
-        As in `covariance.order`, such as `lever_arm_x_m`.
+        Component as in `covariance.order`, such as `lever_arm_x_m`.
     """
     stems = catalogue("parameters")
     name, unit = split_unit(component)

@@ -29,7 +29,7 @@ def grades(std: Array, observable: np.ndarray, limit: float = np.inf) -> tuple[G
     """Return the grade of each component of a parameter.
 
     Green up to the limit, orange up to twice the limit, red above; grey where the data do not
-    determine the component, or nobody knows how well they do.
+    determine the component, or it is not known how well they do.
 
     Parameters
     ----------
@@ -114,13 +114,13 @@ def verdict_of_result(
     findings : sequence of Finding
         What is known of the records and of the result.
     estimates : sequence of Estimate
-        Calibration, against whose grades it is held.
+        Calibration whose grades it is compared with.
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     converged : bool
         Whether the solver reached a minimum.
     iterations : int
-        That it took.
+        Iterations that it took.
     """
     found = [*findings, *_uncertain(findings, estimates, limits)]
     if not converged and not any(f.severity == "error" for f in found):

@@ -59,13 +59,13 @@ class DeadReckoning:
     Parameters
     ----------
     time : ndarray, shape (G,), s
-        Of the grid: of the log or the compass, whichever is faster.
+        Times of the grid: of the log or the compass, whichever is faster.
     heading : ndarray, shape (G,)
         Clockwise from north, unwrapped, rad.
     velocity : ndarray, shape (G, 2), m/s
         Through the water or over ground, east and north.
     height, climb : ndarray, shape (G,)
-        Above the ellipsoid and its rate, m, m/s.
+        Height above the ellipsoid and its rate, m, m/s.
     density : ndarray, shape (G, 2, 2), m²/s³
         Power spectral density of changes of the true velocity.
     spread : ndarray, shape (G,), m²
@@ -73,9 +73,9 @@ class DeadReckoning:
     heading_std, height_std, climb_std : float
         White noise of each value, rad, m, m/s.
     log : SpeedLog
-        On this grid.
+        Log on this grid.
     beacons : Beacons
-        As recorded.
+        Beacons as recorded.
     parameters : tuple of Parameter
         Constants with priors, fixed ones included.
     """
@@ -345,11 +345,11 @@ def as_planar(
     Parameters
     ----------
     trial : Trial
-        With beacons.
+        Trial with beacons.
     frame : LocalFrame
         Tangent frame of the motion.
     time : ndarray, shape (K,), s
-        Of the motion.
+        Times of the motion.
     nRb : ndarray, shape (K, 3, 3)
         Attitude, body to n.
     p_n, v_n : ndarray, shape (K, 3)

@@ -27,9 +27,9 @@ def hypothesis_costs(data: Sequence[Array], priors: Sequence[float]) -> Array:
     Parameters
     ----------
     data : sequence of ndarray
-        Of each track, the terms (T,) of its cost.
+        Costs of each track by its data, the terms (T,) of its cost.
     priors : sequence of float
-        Of each track, the cost by all priors.
+        Cost of each track, the cost by all priors.
     """
     if not data:
         return np.empty(0)
@@ -50,7 +50,7 @@ def significant_costs(single: Sequence[Array]) -> Array:
     Parameters
     ----------
     single : sequence of ndarray
-        Of each fit, the terms (T,) of its cost.
+        Costs of each fit, the terms (T,) of its cost.
     """
     if not single:
         return np.empty(0)

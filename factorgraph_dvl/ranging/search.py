@@ -41,7 +41,7 @@ class RangingRows:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the measurements.
+        Times of the measurements.
     moved, velocity : ndarray, shape (M, 2) or (M, 3)
         Displacement since the start, m, and velocity of the transponder, m/s, dead-reckoned.
     place : ndarray, shape (M, 2), m
@@ -49,7 +49,7 @@ class RangingRows:
     above : ndarray, shape (M,), m
         Height of the transponder over the beacon.
     range, rate : ndarray, shape (M,)
-        As measured, m, m/s; nan where not.
+        Range and its rate as measured, m, m/s; nan where not.
     range_std, rate_std : ndarray, shape (M,)
         Standard deviations with the noise of dead reckoning.
     since : ndarray, shape (M,), s
@@ -206,7 +206,7 @@ def search(
     mean, std : ndarray, shape (2,), m
         Prior of the first position.
     current_std : ndarray, shape (2,), m/s, optional
-        Of the current; None where none is estimated.
+        Standard deviation of the current; None where none is estimated.
     """
     total = rows.time.size
     if total < _LEAST_ROWS:

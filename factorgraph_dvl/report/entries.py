@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
 from factorgraph_dvl.quality.verdict import Grade
 from factorgraph_dvl.report.table import Mark, Table
 from factorgraph_dvl.report.tables import GRADES
+from factorgraph_dvl.sensors.dvl import MISALIGNMENT
 
 TITLE = "Enter in your DVL"
 # Why a value must not be entered, by its grade.
@@ -32,11 +34,11 @@ class Entry:
     key : str
         Name with unit, as in `instrument.yaml`.
     name, unit : str
-        As people read them.
+        Name and unit as people read them.
     rule : str
         What a positive number means.
     value, std : float
-        In `unit`.
+        Value and standard deviation in `unit`.
     grade : Grade
         Red and grey values must not be entered.
     """
@@ -118,6 +120,16 @@ def conventions(i: InstrumentTerms) -> tuple[str, str, str]:
     )
 
 
+def sum_with_compass(findings: Iterable[Finding]) -> Finding | None:
+    """Return the finding that data determine only the sum of mount and compass, if there is one.
+
+    It comes before the values: yaw alone is as uncertain as the stated error of the heading.
+    """
+    return next(
+        (f for f in findings if f.code == Code.HEADING_ERROR and f.parameter == MISALIGNMENT), None
+    )
+
+
 def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequence[str]]]:
     """Return what a maker calls the numbers: name, number, unit, and the entries they are from.
 
@@ -126,7 +138,7 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequ
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str
-        As a certificate names it; there are no rows for a maker that is not known.
+        Maker as a certificate names it; there are no rows for a maker that is not known.
     """
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     angles = ("roll", "pitch", "yaw")

@@ -41,7 +41,7 @@ def calibration_table(
     solution : Solution
         Solution with the estimates.
     known : mapping of str to (float, float), optional
-        By component the truth, and the error over its standard deviation.
+        Truth by component, and the error over its standard deviation.
     """
     table = Table(title="Calibration")
     table.column("parameter")

@@ -23,9 +23,9 @@ class Result:
     Parameters
     ----------
     measured : str
-        In a line, with its numbers.
+        What was measured, in a line, with its numbers.
     verdict : Verdict
-        By these numbers.
+        Verdict by these numbers.
     details : tuple of str, optional
         Lines of Markdown: tables, reasons.
     figure : Figure, optional
@@ -67,11 +67,11 @@ class Paper:
     Parameters
     ----------
     name : str
-        As the command has it.
+        Name as the command has it.
     reference : str
         Authors, title, journal, year.
     entries : tuple of Entry
-        In the order of the publication.
+        Entries in the order of the publication.
     """
 
     name: str
@@ -85,7 +85,7 @@ def scenario(name: str) -> Scenario:
 
 
 def judged(printed: bool, corrected: bool = False) -> Verdict:
-    """Return the verdict on what holds as printed, with a correction, or not at all."""
+    """Return the verdict on what is right as printed, with a correction, or not at all."""
     if printed:
         return "reproduced"
     return "corrected" if corrected else "not reproducible"

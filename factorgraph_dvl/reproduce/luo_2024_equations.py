@@ -44,7 +44,7 @@ def _apart(printed: Array, true: Array) -> float:
 
 
 def _misfit(what: str, printed: float, corrected: float | None = None) -> Result:
-    """Return the result of an equation that holds, holds with a correction, or does not."""
+    """Return the result of an equation that is right, right with a correction, or wrong."""
     text = f"{what}: {printed:.1e} relative"
     if corrected is not None:
         text = f"{what}: as printed off by {printed:.2g}, corrected by {corrected:.1e}, relative"

@@ -129,7 +129,7 @@ def _model(seeds: int) -> Result:
 
 
 def _steps(seeds: int) -> Result:
-    """Hold the recursion of section 4 against what the module adds up."""
+    """Compare the recursion of section 4 with what the module adds up."""
     points = _points(_speeds("speeds and turns"), 0)
     three, _ = with_bias(*_priors())
     P, x = prior_of(three).covariance.copy(), np.zeros(9)

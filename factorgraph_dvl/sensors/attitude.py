@@ -147,7 +147,7 @@ class Attitude:
     def from_columns(
         cls, settings: AttitudeSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], stack(columns, COLUMNS) * DEG, source)
 
     def columns(self) -> dict[str, Array]:
@@ -328,7 +328,7 @@ class AttitudeAngles(ObservationByRows):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the samples.
+        Times of the samples.
     measured : ndarray, shape (M, 3), rad
         Roll, pitch, heading.
     std : ndarray, shape (M, 3), rad
@@ -338,7 +338,7 @@ class AttitudeAngles(ObservationByRows):
     body_axes : BodyAxes
         Axes of the body.
     clock : Clock
-        Of the sensor.
+        Clock of the sensor.
     label : str, optional
         Name of the measurement.
     """

@@ -144,7 +144,7 @@ class Beacons:
     def from_columns(
         cls, settings: BeaconSettings, columns: Mapping[str, Any], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(
             settings,
             columns["time_s"],
@@ -222,7 +222,7 @@ class _ToBeacon(PlainObservation):
     measured : ndarray, shape (M,)
         M or m/s.
     std : float
-        Of each, the same unit.
+        Standard deviation of each depth, in the same unit.
     place_n : ndarray, shape (3,), m
         Stated position of the beacon.
     nRl : ndarray, shape (3, 3)

@@ -67,23 +67,23 @@ class PointPosition(_OfPoint):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the fixes.
+        Times of the fixes.
     measured_n : ndarray, shape (M, 3), m
         Position in n.
     lRn : ndarray, shape (M, 3, 3)
-        N to the local-level axes in which `std` holds.
+        N to the local-level axes for which `std` is right.
     std : ndarray, shape (M, 3), m
         East, north, up.
     label : str
         Name of the measurement.
     clock : Clock
-        Of the sensor.
+        Clock of the sensor.
     lever_arm : ndarray or str
-        To the point, (3,), m, in the axes of its carrier; or the parameter that it is.
+        Lever arm to the point, (3,), m, in the axes of its carrier; or the parameter that it is.
     bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
         Axes of that carrier to body.
     components, noise_groups, correlated : optional
-        As in `Observation`.
+        Components, noise groups and correlated as in `Observation`.
     errors : mapping of str to ndarray, optional
         Parameters whose sum, by these derivatives (M, 3, n), is what is measured too much.
     """
@@ -122,7 +122,7 @@ class PointVelocity(_OfPoint):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the fixes.
+        Times of the fixes.
     measured_l : ndarray, shape (M, 3), m/s
         East, north, up at the vehicle.
     lRn : ndarray, shape (M, 3, 3)
@@ -132,15 +132,15 @@ class PointVelocity(_OfPoint):
     label : str
         Name of the measurement.
     clock : Clock
-        Of the sensor.
+        Clock of the sensor.
     lever_arm : ndarray or str
-        To the point, (3,), m, in the axes of its carrier; or the parameter that it is.
+        Lever arm to the point, (3,), m, in the axes of its carrier; or the parameter that it is.
     bRc : ndarray, shape (M, 3, 3) or (3, 3), optional
         Axes of that carrier to body.
     omega_cb_b : ndarray, shape (M, 3) or (3,), rad/s, optional
         Rate of the body relative to that carrier.
     components, noise_groups, correlated : optional
-        As in `Observation`.
+        Components, noise groups and correlated as in `Observation`.
     errors : mapping of str to ndarray, optional
         Parameters whose sum, by these derivatives (M, 3, n), is what is measured too much.
     """

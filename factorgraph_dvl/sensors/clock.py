@@ -85,7 +85,7 @@ class Clock:
         values : mapping of str to ndarray
             Offset and rate by name, SI.
         zero : float, s
-            When the offset holds.
+            When the offset is valid.
         """
         offset, rate = float(values[self.offset.name][0]), float(values[self.rate.name][0])
         return offset + rate * (time - zero)

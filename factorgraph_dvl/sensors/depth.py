@@ -54,7 +54,7 @@ class Depth:
     time : ndarray, shape (M,), s
         Strictly increasing.
     depth : ndarray, shape (M,)
-        Below the sea surface, positive down, m; nan where not measured.
+        Depth below the sea surface, positive down, m; nan where not measured.
     source : str, optional
         Name of the file, for messages.
     """
@@ -79,7 +79,7 @@ class Depth:
     def from_columns(
         cls, settings: DepthSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], columns["depth_m"], source)
 
     def columns(self) -> dict[str, Array]:
@@ -126,7 +126,7 @@ class DepthBelowSurface(PlainObservation):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the measurements.
+        Times of the measurements.
     measured : ndarray, shape (M,), m
         Positive down.
     std : float
@@ -134,7 +134,7 @@ class DepthBelowSurface(PlainObservation):
     lever_arm : ndarray, shape (3,)
         IMU to sensor, in body, m.
     frame : LocalFrame
-        Of n.
+        Frame n.
     """
 
     time: Array

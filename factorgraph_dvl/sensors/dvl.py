@@ -175,7 +175,7 @@ class Dvl:
     def from_columns(
         cls, settings: DvlSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         velocity, std = stack(columns, VELOCITY_COLUMNS), stack(columns, STD_COLUMNS)
         return cls(settings, columns["time_s"], velocity, std, source)
 
@@ -318,7 +318,7 @@ class DvlVelocity(ObservationByRows):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        As in the file.
+        Times as in the file.
     measured_d : ndarray, shape (M, 3), m/s
         Velocity in d.
     std : ndarray, shape (M, 3), m/s

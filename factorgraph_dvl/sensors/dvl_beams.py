@@ -193,7 +193,7 @@ class DvlBeams:
     source : str, optional
         Name of the file, for messages.
     prefix : str, optional
-        Of the parameters that a `dvl` beside it has under the same names.
+        Prefix of the parameters that a `dvl` beside it has under the same names.
     """
 
     settings: DvlBeamsSettings
@@ -223,7 +223,7 @@ class DvlBeams:
     def from_columns(
         cls, settings: DvlBeamsSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], stack(columns, settings.more_columns), source)
 
     def columns(self) -> dict[str, Array]:
@@ -348,7 +348,7 @@ class BeamVelocity:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the pings.
+        Times of the pings.
     measured : ndarray, shape (M, N), m/s
         Velocities along the beams; any number where lost.
     lost : ndarray of bool, shape (M, N)
@@ -360,7 +360,7 @@ class BeamVelocity:
     lever_arm : str
         Name of the parameter.
     clock : Clock
-        Of the instrument.
+        Clock of the instrument.
     """
 
     time: Array

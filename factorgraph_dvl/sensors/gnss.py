@@ -97,8 +97,8 @@ class Gnss:
     source : str, optional
         Name of the file, for messages.
     turning : TurntableMotion, optional
-        Of the body relative to the ship that carries the antenna; None = the antenna is fixed to
-        the body.
+        Rotation of the body relative to the ship that carries the antenna; None = the antenna is
+        fixed to the body.
 
     Examples
     --------
@@ -165,7 +165,7 @@ class Gnss:
     def from_columns(
         cls, settings: GnssSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         geodetic = stack(columns, POSITION_COLUMNS) * GEODETIC_SI
         velocity, position_std, velocity_std = (stack(columns, group) for group in cls.optional)
         return cls(

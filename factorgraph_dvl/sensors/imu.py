@@ -202,15 +202,15 @@ class ImuErrorStd:
     Parameters
     ----------
     gyro_scale : float
-        Of a diagonal element of Mg.
+        Standard deviation of a diagonal element of Mg.
     gyro_misalignment : float
-        Of an off-diagonal element of Mg, rad.
+        Standard deviation of an off-diagonal element of Mg, rad.
     gyro_g_sensitivity : float
-        Of an element of Gg, (rad/s)/(m/s²).
+        Standard deviation of an element of Gg, (rad/s)/(m/s²).
     accel_scale : float
-        Of a diagonal element of Ma.
+        Standard deviation of a diagonal element of Ma.
     accel_misalignment : float
-        Of an element of Ma below the diagonal, rad.
+        Standard deviation of an element of Ma below the diagonal, rad.
     """
 
     gyro_scale: float = 0.0
@@ -355,7 +355,7 @@ class Imu:
     def from_columns(
         cls, settings: ImuSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         gyro, accel = stack(columns, COLUMNS[1:4]), stack(columns, COLUMNS[4:7])
         return cls(settings, columns["time_s"], gyro, accel, source)
 

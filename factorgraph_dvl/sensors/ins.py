@@ -103,7 +103,7 @@ class Ins:
     rph : ndarray, shape (M, 3)
         Roll, pitch, heading, rad; nan where not known.
     std : ndarray, shape (M, 9)
-        Standard deviations of the three, m, m/s and rad; nan where the settings' hold.
+        Standard deviations of the three, m, m/s and rad; nan = as the settings state.
     source : str, optional
         Name of the file, for messages.
     """
@@ -146,7 +146,7 @@ class Ins:
     def from_columns(
         cls, settings: InsSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(
             settings,
             columns["time_s"],

@@ -59,7 +59,7 @@ class ParameterSpec:
     unit : str, optional
         One of `UNITS`.
     labels : tuple of str, optional
-        Of the n components, `SCALAR` for a number.
+        Labels of the n components, `SCALAR` for a number.
     kind : Kind, optional
         How the components are to be understood: as they are, as angles, which are the same after
         a full turn, as a rotation vector, or as turns of unit vectors, two each.
@@ -124,9 +124,9 @@ class JointPrior:
     source : str
         Name of the file, for messages.
     values : mapping of str to ndarray, shape (n,)
-        By reported name, in reported units.
+        Values by reported name, in reported units.
     covariance : ndarray, shape (N, N)
-        Of all their components, in the order of `values`, in reported units.
+        Covariances of all their components, in the order of `values`, in reported units.
     inputs : tuple of str, optional
         Fingerprints of the data that it came from.
 
@@ -194,8 +194,8 @@ class Parameter:
     joint : JointPrior, optional
         The calibration of several parameters that mean and sigma come from.
     nominal : ndarray, shape (N, 3), optional
-        Of directions: unit vectors in body, which the components turn, two each. Files hold the
-        directions.
+        Nominal directions: unit vectors in body, which the components turn, two each. Files
+        contain the directions.
     """
 
     spec: ParameterSpec

@@ -47,8 +47,8 @@ class Motion:
         Standard deviation of omega_eb_b from the gyro's noise and from motion that its samples do
         not resolve.
     turning_b, moving_n : ndarray, shape (M, 3), optional
-        By how much attitude and position change faster than omega_eb_b and v_n say, rad/s and m/s:
-        where two motions that differ are blended.
+        Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
+        and m/s: where two motions that differ are blended.
     """
 
     nRb: Array
@@ -69,13 +69,13 @@ class Linearization:
     Parameters
     ----------
     residual : ndarray, shape (M, d)
-        In the unit of the measurement.
+        Residual in the unit of the measurement.
     d_theta : ndarray, shape (M, d, 3), optional
-        With respect to theta in nRb Exp(theta).
+        Derivative with respect to theta in nRb Exp(theta).
     d_p, d_v : ndarray, shape (M, d, 3), optional
-        With respect to p_n and v_n.
+        Derivatives with respect to p_n and v_n.
     d_omega : ndarray, shape (M, d, 3), optional
-        With respect to omega_eb_b.
+        Derivative with respect to omega_eb_b.
     d_parameters : dict of str to ndarray, optional
         Name to (M, d, n); for a rotation, with respect to delta in R Exp(delta).
     """
@@ -125,7 +125,7 @@ class SensorClock(Protocol):
 
 @dataclass(frozen=True)
 class ExpectedCorrelation:
-    """What is known beforehand of noise that persists from one measurement to the next.
+    """What is known in advance of noise that persists from one measurement to the next.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class ScaleWalk:
     rate : float, 1/√s
         Standard deviation of its change.
     time : ndarray, shape (M,), s
-        Of the measurements, in order.
+        Times of the measurements, in order.
     measured : ndarray, shape (M, d)
         What was measured; a unit of scale adds what is predicted of it.
     """
@@ -223,7 +223,7 @@ class Observation(Protocol):
 
     @property
     def correlated(self) -> ExpectedCorrelation | None:
-        """What is known beforehand of noise that persists; None = nothing."""
+        """What is known in advance of noise that persists; None = nothing."""
 
     @property
     def scale_walk(self) -> ScaleWalk | None:
@@ -284,7 +284,7 @@ class ObservationByRows(PlainObservation):
 
 
 class SensorSection(Section, frozen=True, kw_only=True):
-    """A sensor's section of trial.yaml, with the table that holds its record.
+    """A sensor's section of trial.yaml, with the table that contains its record.
 
     `noise` says whether the stated noise is a start value or final; unset = as the trial says.
     """
@@ -306,7 +306,7 @@ class SensorSection(Section, frozen=True, kw_only=True):
 class SensorRecord(Protocol):
     """A sensor's record, and how it stands in files.
 
-    `section` names its part of trial.yaml and its table, `section_type` holds the
+    `section` names its part of trial.yaml and its table, `section_type` contains the
     settings, `specs` lists what can be calibrated, with each number of components. Of the
     columns, `required` and the settings' `more_columns` must be there, and of each group of
     `optional` ones all or none.
@@ -324,7 +324,7 @@ class SensorRecord(Protocol):
 
     @classmethod
     def from_columns(cls, settings: Any, columns: Mapping[str, Array], source: str) -> Self:
-        """Return the record that a table holds; columns that it does not have are nan."""
+        """Return the record in a table; columns that it does not have are nan."""
 
     def columns(self) -> dict[str, Array]:
         """Return the record as a table."""
@@ -370,7 +370,7 @@ class Attitudes:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the attitudes.
+        Times of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Attitude of the sensor's axes.
     sigma : ndarray, shape (M,), rad

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.settings.ranges import range_of
+from factorgraph_dvl.settings.ranges import SWAPPED, could_be_longitude, range_of
 
 # Weights of the samples two before, one before, one after and two after, through which a cubic
 # passes.
@@ -105,6 +105,7 @@ def check_range(
                 f"{name} = {values[bad[0]]:.6g} is out of range",
                 where=at_row(source, bad[0]),
                 expected=f"{low:g} to {high:g} {unit}{_other_unit(values, high, unit)}",
+                hint=SWAPPED if could_be_longitude(name, float(values[bad[0]])) else "",
             )
 
 

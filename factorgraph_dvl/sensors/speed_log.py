@@ -97,7 +97,7 @@ class Heading:
     def from_columns(
         cls, settings: HeadingSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], columns["heading_deg"] * DEG, source)
 
     def columns(self) -> dict[str, Array]:
@@ -136,7 +136,7 @@ class SpeedLog:
     speed : ndarray, shape (M,)
         Ahead, m/s; nan where not measured.
     starboard : ndarray, shape (M,)
-        To starboard, m/s; nan where not measured, which stands for none.
+        Speed to starboard, m/s; nan where not measured, which stands for none.
     source : str, optional
         Name of the file, for messages.
     """
@@ -163,7 +163,7 @@ class SpeedLog:
     def from_columns(
         cls, settings: LogSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(
             settings, columns["time_s"], columns["speed_m_s"], columns["starboard_m_s"], source
         )
@@ -223,11 +223,11 @@ class LogVelocity(ObservationByRows):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the measurements.
+        Times of the measurements.
     measured : ndarray, shape (M, 2), m/s
         Ahead and to starboard.
     std : ndarray, shape (M, 2), m/s
-        Of each.
+        Standard deviation of each component.
     body_axes : BodyAxes
         Axes of the body.
     """

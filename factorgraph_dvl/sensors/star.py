@@ -104,7 +104,7 @@ class Star:
     quaternion : ndarray, shape (M, 4)
         Scalar first, of iRs: the tracker's axes to GCRS; nan where not measured.
     covariance : ndarray, shape (M, 3, 3), rad²
-        Of phi in iRs Exp(phi).
+        Covariances of phi in iRs Exp(phi).
     source : str, optional
         Name of the file, for messages.
     vectors : StarVectors, optional
@@ -141,7 +141,7 @@ class Star:
     def from_columns(
         cls, settings: StarSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds: quaternions, or vectors."""
+        """Return the record in a table: quaternions, or vectors."""
         time = columns["time_s"]
         quaternion, vectors = (stack(columns, group) for group in cls.optional)
         as_vectors = not np.isnan(vectors).all()
@@ -258,7 +258,7 @@ class Star:
 
         The square is the loss of Wahba's problem over sigma² and the degrees of freedom: two
         components across each direction, less three of each attitude. nan where the record
-        holds attitudes.
+        contains attitudes.
         """
         v = self.vectors_of_epochs
         if v is None:
@@ -355,7 +355,7 @@ class StarAttitude(PlainObservation):
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the attitudes.
+        Times of the attitudes.
     nRs : ndarray, shape (M, 3, 3)
         Measured.
     axes : ndarray, shape (M, 3, 3)

@@ -64,7 +64,7 @@ class Turntable:
     def from_columns(
         cls, settings: TurntableSettings, columns: Mapping[str, Array], source: str
     ) -> Self:
-        """Return the record that a table holds."""
+        """Return the record in a table."""
         return cls(settings, columns["time_s"], columns["angle_deg"] * DEG, source)
 
     def columns(self) -> dict[str, Array]:

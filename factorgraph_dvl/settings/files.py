@@ -32,13 +32,13 @@ def read_bytes(
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     limit : int
-        Of its size, bytes.
+        Limit of its size, bytes.
     expected : str
-        What it should hold, for messages.
+        What it should contain, for messages.
     kind : type of ConfigError or DataError, optional
-        Of the error.
+        Kind of the error.
 
     Raises
     ------
@@ -73,13 +73,13 @@ def open_file(
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     expected : str
-        What it should hold, for messages.
+        What it should contain, for messages.
     where : str, optional
         Name of the file in messages; by default its path.
     kind : type of ConfigError or DataError, optional
-        Of the error.
+        Kind of the error.
 
     Raises
     ------

@@ -110,6 +110,14 @@ def range_of(name: str) -> Range | None:
     return None if unit is None else _VALUES[unit]
 
 
+SWAPPED = "Latitude and longitude seem to be swapped"
+
+
+def could_be_longitude(name: str, value: float) -> bool:
+    """Return whether a latitude that cannot be one would be a longitude."""
+    return name.endswith("lat_deg") and 90.0 < abs(value) <= 360.0
+
+
 def _longest(parts: list[str], known: Mapping[str, object]) -> str | None:
     tails = ("_".join(parts[i:]) for i in range(len(parts)))
     return next((tail for tail in tails if tail in known), None)
@@ -122,7 +130,8 @@ def out_of_range(name: str, values: Iterable[float]) -> str:
         if not math.isfinite(value):
             return f"`{name}` must be finite"
         if limits is not None and not limits.holds(value):
-            return f"`{name}` must be {limits}, not {value:g}"
+            swapped = f". {SWAPPED}" if could_be_longitude(name, value) else ""
+            return f"`{name}` must be {limits}, not {value:g}{swapped}"
         if is_spread(name) and 0.0 < value < _LEAST_STD:
             return f"`{name}` must be {_LEAST_STD:g} or more, or 0, not {value:g}"
     return ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -13,6 +14,7 @@ import yaml
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.settings.convert import from_plain
 from factorgraph_dvl.settings.files import MEGABYTE, read_bytes
+from factorgraph_dvl.settings.ranges import range_of
 
 T = TypeVar("T")
 Key = str | int
@@ -60,7 +62,7 @@ def read_yaml(path: Path, kind: type[T], *, source: str = "") -> T:
     Parameters
     ----------
     path : path-like
-        Of the file.
+        Path of the file.
     kind : type of T
         The type; it should forbid unknown fields.
     source : str, optional
@@ -123,8 +125,9 @@ def _compose(text: str, source: str) -> yaml.Node:
         root = yaml.compose(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
+        problem = str(error.problem or error.context)
         raise ConfigError(
-            f"not valid YAML: {error.problem or error.context}",
+            f"not valid YAML: {_in_our_words(problem)}",
             where=f"{source} line {mark.line + 1}" if mark else source,
         ) from None
     except (yaml.YAMLError, RecursionError) as error:
@@ -137,6 +140,27 @@ def _compose(text: str, source: str) -> yaml.Node:
             expected="keys and values, such as `format: 1`",
         )
     return root
+
+
+# What PyYAML says, and what is wrong then.
+_PROBLEMS = {
+    "'\\t' that cannot start": "a tab, where YAML takes spaces only",
+    "mapping values are not allowed": "a colon within a value (put it in quotes), or a line "
+    "that is indented too far",
+    "could not find expected ':'": "a line without a colon after its key",
+    "expected ',' or": "a bracket or brace is not closed, or a comma is missing",
+    "expected the node content": "a bracket or brace is not closed, or a value is missing",
+    "expected <block end>": "a line is not indented as those above it",
+    "unexpected end of stream": "a quotation mark is not closed",
+    "undefined alias": "a word that begins with `*`: put it in quotes",
+    "cannot start any token": "a special character at the beginning of a value: put it in quotes",
+    "special characters are not allowed": "a control character",
+}
+
+
+def _in_our_words(problem: str) -> str:
+    """Return what is wrong with YAML, by what its parser says."""
+    return next((said for key, said in _PROBLEMS.items() if key in problem), problem)
 
 
 def _line(node: yaml.Node) -> int:
@@ -233,11 +257,30 @@ def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) 
     for key in path:
         found = found[key]
     shown = "empty" if found is None else repr(found) if len(repr(found)) < 60 else "wrong"
-    return ConfigError(
-        f"{_dotted(path)} is {shown}",
-        where=where(path),
-        expected=_expected(reason, _descend(kind, path)),
-    )
+    expected = _expected(reason, _descend(kind, path))
+    name = next((key for key in reversed(path) if isinstance(key, str)), "")
+    limits = range_of(name)
+    if isinstance(found, str) and expected.startswith("a number") and limits and limits.unit:
+        given = _WITH_UNIT.fullmatch(found.strip())
+        expected = expected.replace("a number", f"a number in {limits.unit}", 1)
+        if given:
+            factor = _FACTORS.get((given["unit"], limits.unit))
+            value = "" if factor is None else f": {float(given['number']) * factor:g}"
+            expected += f", without a unit{value}"
+    return ConfigError(f"{_dotted(path)} is {shown}", where=where(path), expected=expected)
+
+
+_WITH_UNIT = re.compile(
+    r"(?P<number>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\s\d.]\S*)"
+)
+# How many of the second unit one of the first is.
+_FACTORS = {
+    **{("mm", "m"): 1e-3, ("cm", "m"): 1e-2, ("km", "m"): 1e3, ("m", "m"): 1.0},
+    **{("mm/s", "m/s"): 1e-3, ("cm/s", "m/s"): 1e-2, ("kn", "m/s"): 1852.0 / 3600.0},
+    **{("m/s", "m/s"): 1.0, ("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("s", "s"): 1.0},
+    **{("°", "deg"): 1.0, ("deg", "deg"): 1.0, ("rad", "deg"): 180.0 / math.pi},
+    **{("mg", "µg"): 1e3, ("µg", "µg"): 1.0, ("ug", "µg"): 1.0},
+}
 
 
 def _expected(reason: str, kind: Any) -> str:

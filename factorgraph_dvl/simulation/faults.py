@@ -370,7 +370,7 @@ def imu_errors(
     g_sensitivity : sequence of sequence of float, shape (3, 3)
         What each component of the specific force adds to the gyros, (rad/s)/(m/s²).
     accel : sequence of sequence of float, shape (3, 3)
-        As `gyro`.
+        Accelerometer as `gyro`.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:

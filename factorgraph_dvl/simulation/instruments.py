@@ -402,7 +402,7 @@ class TurntableTruth(SimulatedInstrument, frozen=True, kw_only=True):
             raise ValueError("`turns` must follow one another")
 
     def claimed(self) -> dict[str, Any]:
-        """Return nothing: the trial holds the angle."""
+        """Return nothing: the trial contains the angle."""
         return {}
 
 

@@ -217,7 +217,7 @@ def moving_water(
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        In order.
+        Times in order.
     place : ndarray, shape (M, 2), m
         East and north.
     std_m_s, tau_s, distance_m : float

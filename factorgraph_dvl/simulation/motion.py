@@ -82,11 +82,11 @@ def check_size(scenario: ScenarioView, duration: float, steps: float) -> None:
     Parameters
     ----------
     scenario : Scenario
-        With the rates of its sensors.
+        Scenario with the rates of its sensors.
     duration : float
-        Of its motion, s.
+        Duration of its motion, s.
     steps : float
-        Of the integration of its motion.
+        Steps of the integration of its motion.
     """
     rows = {f"{name}.rate_hz": s.rate_hz * duration for name, s in scenario.aids.items()}
     rows["reference_rate_hz"] = scenario.reference_rate_hz * duration

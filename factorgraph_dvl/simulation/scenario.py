@@ -238,7 +238,7 @@ def load_scenario(path: str | PathLike[str]) -> Scenario:
     Raises
     ------
     ConfigError
-        If the file is missing, is not YAML, or holds an unknown key, a wrong type or a
+        If the file is missing, is not YAML, or contains an unknown key, a wrong type or a
         value out of range; the message names file, line and key.
 
     Examples

@@ -25,7 +25,7 @@ def with_stated_errors(trial: Trial, scenario: ScenarioView, seed: int) -> Trial
     Parameters
     ----------
     trial : Trial
-        With white noise, beams and biases of the IMU as simulated, and no other error.
+        Trial with white noise, beams and biases of the IMU as simulated, and no other error.
     scenario : Scenario
         What it was simulated from; without `noise`, only errors that are constant are added.
     seed : int

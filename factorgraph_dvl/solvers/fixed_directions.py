@@ -55,6 +55,11 @@ class SolvedProblem:
     spurious: Array | None = None
     steps: tuple[SolverStep, ...] = ()
 
+    def __repr__(self) -> str:
+        states, parameters = self.problem.chain.node_time.size, len(self.problem.parameters)
+        ended = "converged" if self.minimum.converged else "not converged"
+        return f"<SolvedProblem of {states} states and {parameters} parameters: {ended}>"
+
 
 def with_covariances(
     problem: Problem,

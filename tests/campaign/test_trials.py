@@ -16,10 +16,12 @@ from factorgraph_dvl import save_solution, simulate, solve
 from factorgraph_dvl.campaign.files import write_campaign
 from factorgraph_dvl.campaign.page import write_page
 from factorgraph_dvl.campaign.record import RunRecord, fingerprint_of, read_record, write_record
+from factorgraph_dvl.campaign.tables import joint_table, trials_table
 from factorgraph_dvl.campaign.trials import assembled, labels_of, read_covariates
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.calibration_file import load_calibration
 from factorgraph_dvl.files.earlier_calibration import calibrated_by
+from factorgraph_dvl.report.table import plain
 
 
 def dive(number):
@@ -122,6 +124,23 @@ def test_the_calibration_for_the_next_trial_contains_variation_between_trials(ca
     expected = np.diag(found.joint.covariance) + found.joint.between_std**2
     np.testing.assert_allclose(np.diag(calibration.covariance), expected)
     assert set(calibration.inputs) == {i for t in found.used for i in t.calibration.inputs}
+
+
+def test_the_tables_have_units_and_trials_by_verdict(campaign):
+    found, _ = campaign
+    table = joint_table(found, found.joint)
+    rows = {plain(row[0]): [plain(cell) for cell in row[1:]] for row in table.rows}
+    assert [c.header for c in table.columns] == [
+        "parameter", "value ± σ", "unit", "between trials", "grade",
+    ]  # fmt: skip
+    value, unit, _, grade = rows["lever_arm_y"]
+    assert abs(float(value.partition(" ±")[0]) - 1.2) < 0.1
+    assert unit == "m"
+    assert grade == "green"
+    by_verdict = {plain(row[0]): row[1:] for row in trials_table(found).rows}
+    assert by_verdict["not solved"] == ("1", "c")
+    solved = [t for t in found.trials if t.calibration]
+    assert sum(int(n) for v, (n, _) in by_verdict.items() if v != "not solved") == len(solved)
 
 
 def test_the_page_is_whole_and_leads_to_the_results(campaign):

@@ -62,16 +62,27 @@ def test_a_campaign_shows_what_has_ended_and_the_time_left(
         assert "monday" in shown(progress, text)
 
 
-@pytest.mark.parametrize("kind", ["pipe", "quiet"])
-def test_nothing_is_shown_elsewhere(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("quiet", [False, True])
+def test_a_file_or_pipe_has_a_line_a_stage(quiet: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     text = io.StringIO()
-    monkeypatch.setattr(
-        console, "stderr", lambda: Console(file=text, force_terminal=kind == "quiet")
-    )
-    with ProgressLine(quiet=kind == "quiet") as progress:
+    monkeypatch.setattr(console, "stderr", lambda: Console(file=text, force_terminal=False))
+    with ProgressLine(quiet=quiet) as progress:
         progress("load")
+        progress("all sensors", 1, 10.0)
+        progress("all sensors", 2, 5.0)
         progress("write", done=0.5)
-    with CountLine(2, quiet=kind == "quiet") as count:
+    with CountLine(2, quiet=quiet) as count:
+        count("monday")
+    lines = [line.split(": ")[1] for line in text.getvalue().splitlines()]
+    assert lines == ([] if quiet else ["load", "all sensors", "write", "monday"])
+
+
+def test_a_quiet_terminal_shows_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    monkeypatch.setattr(console, "stderr", lambda: Console(file=text, force_terminal=True))
+    with ProgressLine(quiet=True) as progress:
+        progress("load")
+    with CountLine(2, quiet=True) as count:
         count("monday")
     assert text.getvalue() == ""
 

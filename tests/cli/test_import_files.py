@@ -33,8 +33,8 @@ def test_bad_input_ends_with_2_and_writes_nothing(tmp_path, run):  # noqa: F811
     (tmp_path / "noise.bin").write_bytes(bytes(range(256)) * 20)
     for args, message in (
         ((tmp_path / "none.pd0",), "does not exist"),
-        ((tmp_path / "noise.bin",), "no format is recognised"),
-        ((tmp_path,), "no format is recognised"),
+        ((tmp_path / "noise.bin",), "noise.bin: not an instrument's file; expected one of the"),
+        ((tmp_path,), "a folder, and not the bag"),
         ((write_fixes(tmp_path), "--format", "pd99"), "there is no format `pd99`"),
         ((write_fixes(tmp_path), "--map", tmp_path / "none.yaml"), "does not exist"),
     ):
@@ -54,3 +54,17 @@ def test_guess_prints_a_mapping(tmp_path, run):  # noqa: F811
     assert found["kind"] == "dvl"
     assert found["columns"]["vel_x"] == {"column": "vx_mm_s", "unit": "mm/s"}
     assert found["time"]["unit"] == "ms"
+
+
+def test_a_table_is_told_of_guess_first_and_no_error_lists_all_formats(tmp_path, run):  # noqa: F811
+    (tmp_path / "log.csv").write_text("time;a;b\n1;2;3\n2;3;4\n")
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff\xe0" + bytes(range(256)) * 9)
+    (tmp_path / "notes.txt").write_text("Monday, calm\nno wind\nleft at 9, back at 5, tired\n")
+    said = {
+        name: run("import", tmp_path / name, "--out", tmp_path / "trial").err
+        for name in ("log.csv", "photo.jpg", "notes.txt")
+    }
+    assert "Run `factorgraph-dvl import --guess log.csv` first" in said["log.csv"]
+    for name in ("photo.jpg", "notes.txt"):
+        assert f"{name}: not an instrument's file" in said[name]
+    assert all(len(text) < 250 for text in said.values())

@@ -171,7 +171,7 @@ def values(tmp_path_factory):
 @pytest.mark.parametrize("command", ["observability", "deadreckon"])
 def test_what_is_made_of_a_trial_repeats_its_errors(command, honest, values, tmp_path, run):
     trial = write_trial(tmp_path, upside_down(honest))
-    more = ("--calibration", values) if command == "deadreckon" else ()
+    more = (values,) if command == "deadreckon" else ()
     arguments = (command, trial, *more, "--no-figures", "--quiet")
     (said,) = errors_of(run, trial)
     code, _, err = run(*arguments, "--out", tmp_path / "out")

@@ -51,11 +51,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def commands(root: Path, out: Path) -> dict[str, list[object]]:
     written = ["--out", out, "--no-figures"]
-    reckon = ["deadreckon", root / "trial", "--quiet", *written, "--calibration"]
+    reckon = ["deadreckon", root / "trial"]
     return {
         "crosscheck": ["crosscheck", root / "bad", root / "bad", *written],
-        "deadreckon": [*reckon, root / "bad", "--attitude", "reference"],
-        "attitude": [*reckon, root / "values.json", "--attitude", root / "bad"],
+        "deadreckon": [*reckon, root / "bad", *written, "--quiet", "--attitude", "reference"],
+        "attitude": [
+            *reckon,
+            root / "values.json",
+            *written,
+            "--quiet",
+            "--attitude",
+            root / "bad",
+        ],
     }
 
 

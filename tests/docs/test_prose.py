@@ -7,11 +7,12 @@ their cells are no sentences.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from prose import faults, sentences, split
+from prose import UNCLEAR, faults, sentences, split, words
 from typer.main import get_command
 
 from factorgraph_dvl.cli.app import app
@@ -78,6 +79,29 @@ def text_of(node: ast.AST) -> str:
     return ""
 
 
+# Rooms whose docstrings are not checked yet.
+NOT_CHECKED = ("graph", "replay", "solvers", "statistics")
+# Words that docstrings may use in a technical sense: `dead-reckoned`, `nan stands for`.
+TECHNICAL = {"reckoned", "stand", "stands", "standing", "whatever"}
+# A description that begins so is the rest of a sentence whose subject is missing.
+FRAGMENT = re.compile(r"(?:Of|By|As|That|To|With|In|At|From|On|For|Without|Between)\b(?! default)")
+SECTION = re.compile(r"^(Parameters|Attributes)\n-+\n((?:.*\n)*?)(?=^\S.*\n-+\n|\Z)", re.MULTILINE)
+ITEM = re.compile(r"^\S.* : .*\n {4}(\S.*)", re.MULTILINE)
+
+
+def docstrings() -> Iterator[tuple[str, str]]:
+    """Yield place and text of every docstring of the package, without examples."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        place = path.relative_to(PACKAGE)
+        if place.parts[0] in NOT_CHECKED:
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+            if isinstance(node, kinds) and (text := ast.get_docstring(node)):
+                name = getattr(node, "name", "")
+                yield f"{place}: {name}", text.partition("\nExamples\n")[0] + "\n"
+
+
 def introductions() -> Iterator[tuple[str, str]]:
     """Yield the texts that benchmarks put on their pages."""
     for path in sorted((ROOT / "benchmarks").glob("*.py")):
@@ -135,6 +159,26 @@ def test_sentences_of_the_report_are_plain():
 
 def test_messages_are_plain():
     wrong = found(messages())
+    assert not wrong, "\n".join(wrong)
+
+
+def test_docstrings_use_plain_words():
+    wrong = [
+        f"{where}: {word} -> {UNCLEAR[word]}"
+        for where, text in docstrings()
+        for word in sorted(words(text) & (UNCLEAR.keys() - TECHNICAL))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_descriptions_begin_with_what_they_describe():
+    wrong = [
+        f"{where}: {text}"
+        for where, docstring in docstrings()
+        for _, section in SECTION.findall(docstring)
+        for text in ITEM.findall(section)
+        if FRAGMENT.match(text)
+    ]
     assert not wrong, "\n".join(wrong)
 
 

@@ -54,7 +54,7 @@ COMMANDS = {
     "replay": ("replay", "TRIAL", "--out", "OUT"),
     "kalman": ("kalman", "TRIAL", "--out", "OUT"),
     "observability": ("observability", "TRIAL", "--out", "OUT"),
-    "deadreckon": ("deadreckon", "TRIAL", "--calibration", "RESULT", "--out", "OUT"),
+    "deadreckon": ("deadreckon", "TRIAL", "RESULT", "--out", "OUT"),
     "correct": ("correct", "TRIAL", "RESULT", "--out", "OUT"),
     "crosscheck": ("crosscheck", "RESULT", "RESULT", "--reference", "TRIAL", "--out", "OUT"),
     "plan": ("plan", CONFIGS / "plans" / "harbour.yaml", "--out", "OUT"),
@@ -126,7 +126,7 @@ def test_no_command_writes_over_its_other_inputs(tmp_path, capsys, option):
     save_solution(build_solution(), out)
     (out / "extra.yaml").write_text("{}")
     commands = {
-        "RESULT": ("deadreckon", trial, "--calibration", out / "calibration.json"),
+        "RESULT": ("deadreckon", trial, out / "calibration.json"),
         "--segments": ("observability", trial, "--segments", out / "extra.yaml"),
         "--truth": ("crosscheck", trial, trial, "--truth", out / "extra.yaml"),
     }

@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 from builders import build_solution
 
@@ -47,6 +48,14 @@ def test_residuals_come_back_from_a_solution_folder(tmp_path: Path) -> None:
             np.testing.assert_array_equal(a.time, b.time)
             np.testing.assert_array_equal(a.residual, b.residual)
             np.testing.assert_array_equal(a.sigma, b.sigma)
+
+
+def test_only_what_was_rejected_has_a_reason(tmp_path: Path) -> None:
+    save_solution(build_solution(residuals=USED, rejected=REJECTED), tmp_path / "s")
+    used = pyarrow.parquet.read_schema(tmp_path / "s" / "residuals.parquet").names
+    rejected = (tmp_path / "s" / "rejected.csv").read_text().partition("\n")[0].split(",")
+    assert used == ["time_s", "sensor", "component", "residual", "std", "unit"]
+    assert rejected == ["time_s", "sensor", "component", "reason", "residual", "std", "unit"]
 
 
 def test_a_folder_without_residuals_has_none(tmp_path: Path) -> None:

@@ -185,8 +185,13 @@ BAD_SETTINGS = {
     "twice": ("body_axes: RFU", "body_axes: RFU\nbody_axes: RFU", "body_axes", "twice"),
     "empty section": ("reference: {", "depth:\nreference: {", "depth is empty", "a mapping"),
     "latitude": ("lat_deg: 34.0", "lat_deg: 134", "initial.position.lat_deg", "-90 to 90 deg"),
-    "syntax": ("body_axes: RFU", "body_axes: [RFU", "not valid YAML", "trial.yaml line"),
-    "tab": ("body_axes: RFU", "\tbody_axes: RFU", "not valid YAML", "trial.yaml line"),
+    "swapped": ("lat_deg: 34.0", "lat_deg: 134", "Latitude and longitude seem to be swapped"),
+    "syntax": ("body_axes: RFU", "body_axes: [RFU", "a bracket or brace is not closed"),
+    "tab": ("body_axes: RFU", "\tbody_axes: RFU", "a tab, where YAML takes spaces only"),
+    "colon": ("body_axes: RFU", "body_axes: RFU: b", "a colon within a value (put it in quotes)"),
+    "unit": ("[0.02, 0.02, 0.04]", "[20 mm, 0, 0]", "in m, without a unit: 0.02"),
+    "other unit": ("time_offset_s: 0.0", "time_offset_s: 2 m", "in s, without a unit"),
+    "no number": ("time_offset_s: 0.0", "time_offset_s: late", "expected a number in s"),
     "tag": ("body_axes: RFU", "body_axes: !!python/name:os.system RFU", "body_axes", "plain"),
     "half an attitude": ("  std_deg", "  # std_deg", "only together", "initial"),
 }
@@ -206,6 +211,22 @@ def test_bad_settings_name_line_key_and_expectation(tmp_path: Path, case: str) -
     named = int(message.split()[2].rstrip(":"))
     assert abs(named - line) <= 1, f"{message!r} is about line {line}"
     assert exit_code_of(caught.value) == 2
+
+
+def test_a_folder_or_file_that_is_no_trial_is_named(tmp_path: Path) -> None:
+    result = tmp_path / "result"
+    result.mkdir()
+    (result / "calibration.json").write_text("{}")
+    photo = tmp_path / "photo.jpg"
+    photo.write_bytes(b"x")
+    for path, said in (
+        (result, "the folder of a result, not of a trial"),
+        (tmp_path, "the folder has no trial.yaml"),
+        (photo, "photo.jpg: not a trial; expected a trial folder"),
+        (tmp_path / "none", "the trial does not exist"),
+    ):
+        with pytest.raises(DataError, match=said):
+            load_trial(path)
 
 
 def test_missing_keys_are_named(tmp_path: Path) -> None:
@@ -266,7 +287,7 @@ def test_files_of_a_trial_are_all_that_it_is_read_from(tmp_path: Path) -> None:
 def test_missing_trials_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="nowhere: the trial does not exist"):
         load_trial(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match=r"trial\.yaml: the file does not exist"):
+    with pytest.raises(DataError, match=r"the folder has no trial\.yaml"):
         load_trial(tmp_path)
 
 
@@ -280,6 +301,12 @@ BAD_TABLES = {
     "rate": ("imu.csv", 1, "0,0,0,500,0,0,9", "line 2: gyro_z_rad_s = 500 is out of range"),
     "infinite": ("imu.csv", 1, "0,0,0,inf,0,0,9", "line 2: gyro_z_rad_s"),
     "latitude": ("gnss.csv", 1, "0.5,91,108,0,1,1,1,,,,,,", "line 2: lat_deg = 91 is out of"),
+    "swapped": (
+        "gnss.csv",
+        1,
+        "0.5,108,34,0,1,1,1,,,,,,",
+        "line 2: lat_deg = 108 is out of range; expected -90 to 90 deg. Latitude and longitude",
+    ),
     "half a ping": ("dvl.csv", 1, "0.5,1,,3,,,", "line 2: only some of vel_x_m_s"),
     "no column": (
         "dvl.csv",

@@ -17,6 +17,8 @@ from running import Run, run
 from factorgraph_dvl import load_solution, load_trial, save_trial
 from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.report.entries import entries_of, entries_table
 from factorgraph_dvl.report.files.instrument import instrument_text
 from factorgraph_dvl.report.table import plain
@@ -178,3 +180,17 @@ def test_the_maker_s_own_names_are_in_the_table(maker: str, rows: dict[str, str]
 def test_a_result_without_a_dvl_has_nothing_to_enter() -> None:
     with pytest.raises(DataError, match="no lever_arm_m"):
         instrument_text(build_solution())
+
+
+def test_the_sum_of_mount_and_compass_comes_first() -> None:
+    text = message(
+        "heading_error.about_the_vertical", angle=-1.5, std=0.3, relative=-1.4, relative_std=0.02
+    )
+    own = calibration(alpha=np.array([0.0, 0.0, 1.5]))
+    found = replace(
+        own, findings=(Finding(Code.HEADING_ERROR, text, parameter="misalignment_deg"),)
+    )
+    shown = instrument_text(found)
+    assert "# Mount and compass: about the vertical -1.5" in shown
+    assert shown.index("Mount and compass") < shown.index("enter_in_dvl")
+    assert "Mount and compass" not in instrument_text(own)

@@ -773,7 +773,7 @@ def test_the_command_dead_reckons_beams(solved, tmp_path):
     save_solution(solution, tmp_path / "solved")
     for calibration in (tmp_path / "solved", tmp_path / "trial" / "truth.json"):
         out = tmp_path / f"by-{calibration.stem}"
-        args = ["deadreckon", tmp_path / "trial", "--calibration", calibration, "--out", out]
+        args = ["deadreckon", tmp_path / "trial", calibration, "--out", out]
         with pytest.raises(SystemExit) as done:
             main([*map(str, args), "--no-figures"])
         assert done.value.code == 0

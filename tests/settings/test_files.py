@@ -71,7 +71,7 @@ READ = (
     ("campaign T --out O --covariates F", ["F"]),
     ("correct T S --out O", ["S/calibration.json", "T/dvl.csv"]),
     ("instrument S", ["S/calibration.json"]),
-    ("deadreckon T --calibration S --out O", ["S/calibration.json", "T/dvl.csv"]),
+    ("deadreckon T S --out O", ["S/calibration.json", "T/dvl.csv"]),
     ("crosscheck S S --out O", ["S/calibration.json", "S/trajectory.csv"]),
     ("crosscheck S J --out O", ["J"]),
     ("crosscheck S S --reference T/imu.csv --out O", ["T/imu.csv"]),

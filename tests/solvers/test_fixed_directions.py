@@ -16,6 +16,13 @@ def column(found, name, component):
     return found.problem.columns[name].start + component
 
 
+def test_a_solved_problem_prints_in_a_line():
+    _, found = solved.turning()
+    states = found.problem.chain.node_time.size
+    assert repr(found).startswith(f"<SolvedProblem of {states} states and ")
+    assert len(repr(found)) < 80
+
+
 def test_turns_leave_no_direction_undetermined():
     _, found = solved.turning()
     assert found.fixed.shape[1] == 0

@@ -41,7 +41,7 @@ class Component:
     Parameters
     ----------
     parameter, name : str
-        As in calibration.json, and in its `covariance.order`.
+        Parameter and name as in calibration.json, and in its `covariance.order`.
     a, b : float
         The two values; nan where a result has none.
     std_a, std_b : float

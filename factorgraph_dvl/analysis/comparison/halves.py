@@ -16,7 +16,6 @@ from factorgraph_dvl.plausibility.earlier_calibration import CONTRADICTED_P, DOU
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import JointPrior
-from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
@@ -32,7 +31,7 @@ class Halves:
     Parameters
     ----------
     names : tuple of str
-        Of the n components, as in `covariance.order`.
+        Names of the n components, as in `covariance.order`.
     first, second : ndarray, shape (n,)
         What each half says, in reported units.
     first_std, second_std : ndarray, shape (n,)
@@ -101,7 +100,7 @@ class Halves:
 def halves_of(trial: Trial) -> tuple[Trial, Trial]:
     """Return a trial up to the middle of its IMU's record, and from there.
 
-    What is known of the start holds for the first half only.
+    What is known of the start is valid for the first half only.
 
     Raises
     ------
@@ -116,16 +115,8 @@ def halves_of(trial: Trial) -> tuple[Trial, Trial]:
         )
     record = trial.body_sensor.time
     middle = 0.5 * float(record[0] + record[-1])
-    first, second = (
-        replace(
-            trial,
-            imu=trial.imu and rows_of(trial.imu, (trial.imu.time >= middle) == later),
-            gnss=rows_of(trial.gnss, (trial.gnss.time >= middle) == later),
-            dvl=trial.dvl and rows_of(trial.dvl, (trial.dvl.time >= middle) == later),
-            others=tuple(rows_of(aid, (aid.time >= middle) == later) for aid in trial.others),
-        )
-        for later in (False, True)
-    )
+    first = trial.until(float(np.nextafter(middle, -np.inf)))
+    second = trial.until(np.inf, since=middle)
     imu = second.imu
     if imu is not None:
         imu = replace(imu, prior=imu.prior_after(middle - float(record[0])))
@@ -143,7 +134,7 @@ def compare_halves(trial: Trial, first: Solution, second: Solution) -> Halves:
     trial : Trial
         The whole, for its priors.
     first, second : Solution
-        Of its halves.
+        Solutions of its halves.
     """
     second = same_branch(second, first)
     prior = None if trial.dvl is None else trial.dvl.prior

@@ -115,7 +115,7 @@ def before_after(
         As `dead_reckon`, and if the calibration belongs to other beams.
     """
     truth, scored_by = _truth(trial, orientation_at)
-    corrected, mounting = _calibrated(trial, values)
+    corrected, mounting = with_calibration(trial, values)
     start = _start(trial, dead_reckon(corrected, mounting, orientation_at), orientation_at)
 
     def reckon(trial: Trial, mounting: DvlMounting) -> DeadReckonedTrack:
@@ -164,7 +164,7 @@ def _start(
     return first, displaced(position[None], -off[None])[0]
 
 
-def _calibrated(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, DvlMounting]:
+def with_calibration(trial: Trial, values: Mapping[str, Array]) -> tuple[Trial, DvlMounting]:
     """Return the trial with its beams converted to a DVL, and the mounting that remains."""
     if trial.dvl is not None or trial.beams is None:
         return trial, mounting_of(trial, values)

@@ -158,20 +158,13 @@ def dead_reckon(
     >>> track.geodetic.shape[1]
     3
     """
-    dvl = _log(trial)
-    pings = dvl.time[dvl.locked] - mounting.time_offset
-    orientation = orientation_at(pings)
-    used = orientation.covered
-    if used.sum() < 2:
+    pings, v_b, _ = body_velocity(trial, mounting, orientation_at)
+    if pings.size < 2:
         raise DataError(
             "fewer than two pings have a lock while the attitude is known",
-            where=dvl.source,
+            where=_log(trial).source,
             expected="bottom lock at times that IMU and attitude cover",
         )
-    pings = pings[used]
-    unscaled = (dvl.velocity[dvl.locked][used] - mounting.bias) / (1.0 + mounting.scale_error)
-    rotation = np.cross(orientation.omega_eb_b[used], mounting.lever_arm)
-    v_b = unscaled @ mounting.dRb - rotation
 
     start_time, position = start or _start(
         trial, float(pings[0]), float(pings[-1]), orientation_at
@@ -189,6 +182,38 @@ def dead_reckon(
         rph=rph_from_rotation(nRb, trial.body_axes),
         bridged=float(np.diff(gaps[gaps[:, 0] > start_time], axis=1).sum()),
     )
+
+
+def body_velocity(
+    trial: Trial, mounting: DvlMounting, orientation_at: OrientationAt
+) -> tuple[Array, Array, Array]:
+    """Return what a DVL says of the velocity of the IMU, where lock and attitude are known.
+
+    Parameters
+    ----------
+    trial : Trial
+        Trial with DVL or beams.
+    mounting : DvlMounting
+        Mounting that corrects the velocity.
+    orientation_at : OrientationAt
+        Attitude and turn rate at times (M,).
+
+    Returns
+    -------
+    time : ndarray, shape (M,), s
+        Times of the pings, without the delay of the DVL.
+    velocity : ndarray, shape (M, 3), m/s
+        Velocity of the IMU in body.
+    nRb : ndarray, shape (M, 3, 3)
+        Attitude, body to local-level east, north, up.
+    """
+    dvl = _log(trial)
+    pings = dvl.time[dvl.locked] - mounting.time_offset
+    there = orientation_at(pings)
+    used = there.covered
+    unscaled = (dvl.velocity[dvl.locked][used] - mounting.bias) / (1.0 + mounting.scale_error)
+    v_b = unscaled @ mounting.dRb - np.cross(there.omega_eb_b[used], mounting.lever_arm)
+    return pings[used], v_b, there.nRb[used]
 
 
 def _log(trial: Trial) -> Dvl:

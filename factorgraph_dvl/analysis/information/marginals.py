@@ -58,7 +58,7 @@ class Marginals:
     observable : ndarray of bool, shape (P,)
         Whether the data at least halved the prior's σ.
     grade : tuple of Grade
-        Of the posterior standard deviation against its limit.
+        Grade of the posterior standard deviation against its limit.
     correlation : ndarray, shape (P, P)
         Correlation of the posterior.
     directions : tuple of Direction

@@ -88,7 +88,7 @@ class MountingModel:
     scale_error : ndarray, shape (1,) or (3,)
         Scale error, common or for each axis.
     lever_arm : ndarray, shape (3,), m
-        From the IMU to the DVL, in body.
+        Lever arm from the IMU to the DVL, in body.
     """
 
     misalignment: Array
@@ -114,7 +114,7 @@ class BeamMounting:
     scale_error : ndarray, shape (N,)
         Scale error of each beam.
     lever_arm : ndarray, shape (3,), m
-        From the IMU to the DVL, in body.
+        Lever arm from the IMU to the DVL, in body.
     """
 
     nominal_b: Array

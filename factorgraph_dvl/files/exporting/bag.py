@@ -43,7 +43,7 @@ def write_mcap(trial: Trial, begin: float, path: Path) -> list[str]:
     begin : float, s
         UTC of time zero, since 1970.
     path : path-like
-        Of the file.
+        Path of the file.
 
     Returns
     -------

@@ -52,11 +52,11 @@ def write_pd0(trial: Trial, begin: float, path: Path) -> list[str]:
     Parameters
     ----------
     trial : Trial
-        With `dvl`, or with `dvl_beams` of a Janus instrument.
+        Trial with `dvl`, or with `dvl_beams` of a Janus instrument.
     begin : float, s
         UTC of time zero, since 1970.
     path : path-like
-        Of the file.
+        Path of the file.
 
     Returns
     -------

@@ -36,7 +36,7 @@ class ExportedMotion:
     body_axes : BodyAxes
         Axes of the body.
     utc : ndarray, shape (M,), s
-        Seconds since 1970-01-01T00:00:00 UTC; nan where nobody knows.
+        Seconds since 1970-01-01T00:00:00 UTC; nan where it is not known.
     summary : str
         The verdict, for formats that have room for a remark.
     """

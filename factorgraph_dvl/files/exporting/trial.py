@@ -61,7 +61,8 @@ def export_trial(
     ConfigError
         If there is no such format, or a library that it needs is not installed.
     DataError
-        If the trial cannot be read, holds nothing that the format takes, or a file is in the way.
+        If the trial cannot be read or contains nothing that the format takes, or if a file is in
+        the way.
     """
     if to not in FORMATS:
         raise ConfigError(

@@ -89,7 +89,7 @@ _HEAD = np.dtype(
 
 @dataclass(frozen=True)
 class Ad2cp:
-    """What a file holds, or a part of it.
+    """What a file contains, or a part of it.
 
     Parameters
     ----------
@@ -350,7 +350,7 @@ def is_whole(record: bytes) -> bool:
 
 
 def tracks(records: Sequence[tuple[int, int, bytes]]) -> Records:
-    """Return what records hold that are whole.
+    """Return what records contain that are whole.
 
     Parameters
     ----------

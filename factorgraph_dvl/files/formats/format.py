@@ -164,11 +164,11 @@ class Batch:
     records : Records
         (N,) of `KINDS[kind]`.
     clock : {'utc', 'own', 'day', 'week'}, optional
-        On which `time` is.
+        Clock of `time`.
     stream : str, optional
         Which of several sources in the file: sentence, topic, message.
     axes : {'', 'RFU', 'FRD', 'FLU'}, optional
-        Of the IMU or of the DVL's instrument axes; empty if they are not known.
+        Axes of the IMU or of the DVL's instrument axes; empty if they are not known.
     heading : {'true', 'magnetic', 'unknown'}, optional
         What headings refer to.
     notes : tuple of str, optional
@@ -214,11 +214,11 @@ class Format:
     Parameters
     ----------
     name : str
-        As `import --format` takes it: lower case, short.
+        Name as `import --format` takes it: lower case, short.
     family : {'dvl', 'ins', 'gnss', 'vehicle', 'table'}
-        Of what writes it.
+        Family of the instruments or programs that write it.
     title : str
-        For people: maker and name.
+        Title for people: maker and name.
     share : callable
         Given the path and a sample (its first bytes, and as many from its middle), returns
         the share of the sample that the format explains, 0 to 1. The path may be a folder; its

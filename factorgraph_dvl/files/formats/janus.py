@@ -33,7 +33,7 @@ def from_beams(beams: Array, beam_angle: ArrayLike, convex: ArrayLike = True) ->
         Velocities along beams. One that is nan is replaced by what makes the error velocity zero;
         the error velocity is then nan.
     beam_angle : array_like, shape (N,) or (), rad
-        From the vertical.
+        Beam angle from the vertical.
     convex : array_like of bool, shape (N,) or ()
         Whether beams point outwards.
     """
@@ -73,7 +73,7 @@ def instrument_to_outer(
     coordinates : ndarray, shape (N,)
         `BEAM`, `INSTRUMENT`, `SHIP` or `EARTH`. The first two give unity.
     roll, pitch, heading : ndarray, shape (N,), rad
-        Of the instrument. Heading counts for `EARTH` only.
+        Roll, pitch and heading of the instrument. Heading counts for `EARTH` only.
     alignment : ndarray, shape (N,), rad
         EA, beam 3 clockwise from the bow; counts for `SHIP` only, as the heading is beam 3's.
     tilts_used : ndarray of bool, shape (N,)

@@ -201,6 +201,6 @@ class MappingSettings(Section, frozen=True, kw_only=True):
     trial: dict[str, Any] = msgspec.field(default_factory=dict)
 
     def of(self, path: Path, *, topics: bool = False) -> tuple[TableMapping, ...]:
-        """Return the tables that a file holds, or the topics that a bag does."""
+        """Return the tables that a file contains, or the topics that a bag does."""
         fits = (table for table in self.tables if fnmatchcase(path.name, table.file))
         return tuple(table for table in fits if bool(table.topic) == topics)

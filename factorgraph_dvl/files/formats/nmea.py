@@ -306,7 +306,7 @@ def sentence_batches(block: Sentences, near: float | None, losses: Losses) -> It
     Parameters
     ----------
     block : dict of str to Records
-        As `read_nmea` yields them.
+        Block as `read_nmea` yields them.
     near : float or None, s
         Some time within half a day of sentences that have neither a date nor a time of
         reception; None if there is none.

@@ -142,7 +142,7 @@ def embedded_sentences(
     identity, begin, end : ndarray of int, shape (K, J)
         Kind and place of each data type.
     pings : Records, shape (K,)
-        With `time`.
+        Pings with `time`.
     offset : int
         Position of `data` in the file.
 

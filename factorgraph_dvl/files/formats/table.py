@@ -174,7 +174,7 @@ def header(source: Source, separator: bytes, lines: int) -> tuple[list[str], int
     source : Source
         The table.
     separator : bytes
-        Of its cells.
+        Separator of its cells.
     lines : int
         Number of lines before the data; the last one has the names.
     """

@@ -40,7 +40,7 @@ VELOCITY = np.dtype(
 
 
 def empty(count: int, axes: int = INSTRUMENT) -> Records:
-    """Return records (count,) that hold nothing yet."""
+    """Return records (count,) that contain nothing yet."""
     out = np.zeros(count, VELOCITY)
     for name in VELOCITY.names or ():
         if name not in ("at", "axes"):
@@ -50,7 +50,7 @@ def empty(count: int, axes: int = INSTRUMENT) -> Records:
 
 
 def records(rows: Sequence[Mapping[str, object]], axes: int = INSTRUMENT) -> Records:
-    """Return records of rows that name what they hold."""
+    """Return records of rows that name what they contain."""
     out = empty(len(rows), axes)
     for index, row in enumerate(rows):
         for name, value in row.items():

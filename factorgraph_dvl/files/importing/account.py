@@ -51,7 +51,7 @@ class Account:
     file : str
         Its name.
     types : dict of str to Tally
-        By type.
+        Tallies by type.
     """
 
     file: str

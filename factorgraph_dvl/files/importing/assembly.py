@@ -1,4 +1,4 @@
-"""A trial folder of what raw files hold: sections of trial.yaml, tables, import.log."""
+"""A trial folder of what raw files contain: sections of trial.yaml, tables, import.log."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class Assembly:
     decisions : Decisions
         Takes what was done, and why.
     settings : dict
-        Of trial.yaml, by section.
+        Settings of trial.yaml, by section.
     tables : dict of str to callable
-        By section: given the epoch, yields parts of the table.
+        Tables by section: given the epoch, yields parts of the table.
     """
 
     decisions: Decisions
@@ -64,9 +64,9 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     Parameters
     ----------
     streams : sequence of Timed
-        Of all files.
+        Streams of all files.
     name : str
-        Of the trial.
+        Name of the trial.
     decisions : Decisions
         Takes what was chosen, and what is missing.
 

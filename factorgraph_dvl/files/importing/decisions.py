@@ -22,7 +22,7 @@ class Decisions:
     lines : list of str
         `subject: what was found → what was done`.
     comments : dict of str to str
-        Of keys of trial.yaml, as `section.key`.
+        Comments of keys of trial.yaml, as `section.key`.
     missing : list of str
         What the trial lacks, with what would help.
     accounts : list of Account

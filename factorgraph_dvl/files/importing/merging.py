@@ -85,7 +85,7 @@ class Beside:
         Parameters
         ----------
         time : ndarray, shape (N,), s
-            In order, and behind those of the call before.
+            Times in order, and behind those of the call before.
         """
         begin, end = time[0] - self._margin, time[-1] + self._margin
         while not len(self._time) or self._time[-1] <= end:
@@ -108,7 +108,7 @@ def merge(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
     Parameters
     ----------
     streams : sequence of Timed
-        Of one kind.
+        Streams of one kind.
     decisions : Decisions
         Takes counts of what was dropped, and gaps.
 

@@ -76,7 +76,7 @@ class Navigation:
     Parameters
     ----------
     ins : Merged
-        In order.
+        INS in order.
     deviations : Merged or None
         Its standard deviations, where these have a file of their own.
     with_std : bool
@@ -89,7 +89,7 @@ class Navigation:
 
     @classmethod
     def of(cls, ins: Merged, deviations: Merged | None) -> Navigation:
-        """Return the solution that records hold."""
+        """Return the solution that records contain."""
         stds = [ins.sample[name] for name in _STDS]
         has_own = all(np.isfinite(std).any() for std in stds)
         return cls(ins, None if has_own else deviations, has_own or deviations is not None)

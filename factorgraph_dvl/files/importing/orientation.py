@@ -38,11 +38,11 @@ class ImportedAttitude:
     Parameters
     ----------
     attitude : Merged
-        In order.
+        Attitude in order.
     tilt : bool
         Whether there are roll and pitch.
     declination : float, rad
-        To add to headings.
+        Declination to add to headings.
     std : tuple of float, deg
         Total σ of roll, pitch, heading.
     offset_std : float, deg
@@ -84,7 +84,7 @@ def choose(
     Parameters
     ----------
     streams : sequence of Timed
-        Of all kinds.
+        Streams of all kinds.
     where : tuple of float or None, rad
         Latitude and longitude of the trial, for the declination.
     decisions : Decisions

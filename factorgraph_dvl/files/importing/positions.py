@@ -43,7 +43,7 @@ class Positions:
     Parameters
     ----------
     fixes : Merged
-        In order.
+        Fixes in order.
     courses : Merged or None
         Course and speed over ground.
     height : {'height', 'altitude', ''}
@@ -117,7 +117,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Positions | None:
     Parameters
     ----------
     streams : sequence of Timed
-        Of all kinds.
+        Streams of all kinds.
     decisions : Decisions
         Takes what was chosen, and why.
     """

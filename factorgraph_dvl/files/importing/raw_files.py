@@ -57,7 +57,7 @@ def import_files(
     Parameters
     ----------
     files : sequence of path-like
-        In any order; their names do not matter. Those that end in `.gz` are unpacked.
+        Files in any order; their names do not matter. Those that end in `.gz` are unpacked.
     out : path-like
         Trial folder to write.
     form : str, optional

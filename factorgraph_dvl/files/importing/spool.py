@@ -40,7 +40,7 @@ class Stored:
     path : Path
         File of the records.
     dtype : dtype
-        Of one record.
+        Data type of one record.
     convert : callable, optional
         Applied to records that were read.
     """
@@ -93,9 +93,9 @@ class Stream:
     format : str
         Name of its format.
     kind, clock, stream, axes, heading : str
-        As in `Batch`.
+        Kind, clock, stream, axes and heading as in `Batch`.
     directions : tuple of tuple of float
-        As in `Batch`.
+        Directions as in `Batch`.
     records : Stored
         (N,) of `KINDS[kind]`.
     """
@@ -125,7 +125,7 @@ class Spool:
     Parameters
     ----------
     folder : Path
-        For the records; it exists.
+        Folder for the records; it exists.
     note : callable
         Takes the name of a file and a sentence that its reader decided.
     warn : callable, optional

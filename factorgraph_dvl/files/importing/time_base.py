@@ -45,9 +45,9 @@ class Timed:
     known : int
         Number of records with a time.
     offset_std : float, s
-        Of what may be left of an offset.
+        Standard deviation of what may be left of an offset.
     rate_std : float, ppm
-        Of what may be left of a rate.
+        Standard deviation of what may be left of a rate.
     """
 
     stream: Stream
@@ -85,7 +85,7 @@ def on_utc(streams: Sequence[Stream], spool: Spool, decisions: Decisions) -> lis
     Parameters
     ----------
     streams : sequence of Stream
-        Of all files.
+        Streams of all files.
     spool : Spool
         Takes the times.
     decisions : Decisions

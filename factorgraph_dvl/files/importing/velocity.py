@@ -33,13 +33,13 @@ class Velocities:
     Parameters
     ----------
     pings : Merged
-        In order.
+        Pings in order.
     reference : {'bottom', 'water'}
         What velocities are relative to.
     directions : ndarray, shape (4, 3), or None
         Outward beams, if velocities along beams are to be used.
     std : float, m/s
-        Of a velocity, or of one along a beam.
+        Standard deviation of a velocity, or of one along a beam.
     own_std : bool
         Whether the instrument states that of each ping.
     locked, count : int
@@ -82,7 +82,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
     Parameters
     ----------
     streams : sequence of Timed
-        Of all kinds.
+        Streams of all kinds.
     decisions : Decisions
         Takes what was chosen, and why.
 

@@ -34,7 +34,7 @@ def beam_quality_figure(quality: BeamQuality, *, into: SubFigure | None = None) 
     Parameters
     ----------
     quality : BeamQuality
-        Of beams of which four or more were received together at least once.
+        Quality of the beams, of which four or more were received together at least once.
     into : SubFigure, optional
         Where to draw; by default a new figure.
     """

@@ -55,13 +55,13 @@ def write_convergence_figures(
     Parameters
     ----------
     time : ndarray, shape (H,), s
-        Of the updates.
+        Times of the updates.
     values, std : ndarray, shape (H, n)
         What was known then, in the order of `estimates`.
     latency : ndarray, shape (H,), s
         Time that each update took.
     estimates : sequence of Estimate
-        At the end.
+        Estimates at the end.
     truth : mapping of str to array_like
         True values by reported name; may be empty.
     found : Convergence
@@ -69,7 +69,7 @@ def write_convergence_figures(
     folder : path-like
         Where the files go.
     verdict : Verdict
-        On the calibration.
+        Verdict on the calibration.
     name : str, optional
         Name of the trial.
     kind : {'png', 'svg', 'pdf'}, optional
@@ -98,7 +98,7 @@ def convergence_figure(
     Parameters
     ----------
     time, values, std, estimates, truth : ndarray, sequence of Estimate, mapping
-        As of `write_convergence_figures`.
+        Parameters as of `write_convergence_figures`.
     good_since : float
         A moment to mark, s; nan for none.
     """

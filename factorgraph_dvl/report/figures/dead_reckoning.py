@@ -47,13 +47,13 @@ def write_dead_reckoning_figures(
     Parameters
     ----------
     trial : Trial
-        With its reference, if it has one.
+        Trial with its reference, if it has one.
     result : BeforeAfter
         What to draw.
     folder : path-like
         Where the files go.
     verdict : Verdict, optional
-        On the records.
+        Verdict on the records.
     kind : {'png', 'svg', 'pdf'}, optional
         Format of further files beside the PNG files.
     """

@@ -80,7 +80,7 @@ def write_observability_figures(
     folder : path-like
         Where the PNG files go.
     verdict : Verdict, optional
-        On the result.
+        Verdict on the result.
     kind : {'png', 'svg', 'pdf'}, optional
         Format of further files beside them.
     """

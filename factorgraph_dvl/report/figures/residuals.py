@@ -41,7 +41,7 @@ def residuals_figure(group: Sequence[Residuals], *, into: SubFigure | None = Non
     Parameters
     ----------
     group : sequence of Residuals
-        Of one sensor, a measurement each.
+        Residuals of one sensor, a measurement each.
     into : SubFigure, optional
         Where to draw; by default a new figure.
     """

@@ -48,7 +48,7 @@ def write_figures(
     Parameters
     ----------
     trial : Trial
-        For its GNSS fixes, reference and true calibration.
+        Trial for its GNSS fixes, reference and true calibration.
     solution : Solution
         What to draw.
     folder : path-like
@@ -85,7 +85,7 @@ def plot(
         `track`, `motion`, `calibration`, `correlation`, `error_budget`, `beam_quality`, or the
         residuals of a sensor, such as `dvl_residuals`.
     trial : Trial, optional
-        For its GNSS fixes, reference and true calibration, which are drawn if it is given.
+        Trial for its GNSS fixes, reference and true calibration, which are drawn if it is given.
     axes : matplotlib.axes.Axes, optional
         Axes of your own figure: the panels take their place. By default a new figure.
 

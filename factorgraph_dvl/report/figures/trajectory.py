@@ -126,9 +126,9 @@ def mark_times(ax: Axes, time: Array, track: Array) -> None:
     ax : Axes
         Where the track is drawn.
     time : ndarray, shape (M,), s
-        Of its points.
+        Times of its points.
     track : ndarray, shape (M, 2) or (M, 3)
-        In the units of the axes; east and north first.
+        Positions in the units of the axes; east and north first.
     """
     duration = float(time[-1] - time[0])
     box = ax.dataLim
@@ -181,9 +181,9 @@ def motion_figure(
     Parameters
     ----------
     trajectory : Trajectory
-        With all its epochs: of fewer, a swing may look like another.
+        Trajectory with all its epochs: with fewer, a swing may look like another.
     errors : TrajectoryErrors or None
-        Of the same or of fewer epochs, if there is a reference.
+        Errors of the same or of fewer epochs, if there is a reference.
     into : SubFigure, optional
         Where to draw; by default a new figure.
     """

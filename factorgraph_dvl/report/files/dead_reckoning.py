@@ -42,9 +42,9 @@ def to_json(result: BeforeAfter, about: Mapping[str, Any]) -> bytes:
         "start_s": float(result.calibrated.track.time[0]),
         "duration_s": float(np.ptp(result.calibrated.track.time)),
         "bridged_s": result.calibrated.track.bridged,
-        **_errors(result.calibrated),
-        "uncalibrated": _errors(result.uncalibrated),
-        "without_lever_arm": _errors(result.without_lever_arm),
+        **track_errors(result.calibrated),
+        "uncalibrated": track_errors(result.uncalibrated),
+        "without_lever_arm": track_errors(result.without_lever_arm),
         "lever_arm": {
             "largest_effect_m": result.lever_arm.largest,
             "closed_form_disagreement_m": result.lever_arm.disagreement,
@@ -53,7 +53,8 @@ def to_json(result: BeforeAfter, about: Mapping[str, Any]) -> bytes:
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
 
 
-def _errors(run: Run) -> dict[str, Any]:
+def track_errors(run: Run) -> dict[str, Any]:
+    """Return the errors of a track as JSON has them; nothing if they are not known."""
     s = run.score
     if s is None:
         return {}

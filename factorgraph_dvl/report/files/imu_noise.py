@@ -47,7 +47,7 @@ def noise_table(noise: StaticNoise) -> Table:
 def imu_yaml(noise: StaticNoise) -> str:
     """Return the figures as keys of trial.yaml, the mean square of the three axes.
 
-    The walk of a bias stands for bias instability and rate random walk together: it wanders as
+    The walk of a bias stands for bias instability and rate random walk together: it varies as
     much within an hour.
     """
     gyro, accel = noise.gyro, noise.accel

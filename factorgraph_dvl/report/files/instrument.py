@@ -26,6 +26,7 @@ from factorgraph_dvl.report.entries import (
     hundredths,
     looks_up,
     looks_up_for_trdi,
+    sum_with_compass,
     worst,
 )
 from factorgraph_dvl.solution import Calibration, Solution
@@ -56,7 +57,9 @@ def instrument_text(calibration: Calibration | Solution) -> str:
         If it has no misalignment, scale error or lever arm.
     """
     i = instrument_of(calibration)
+    both = sum_with_compass(calibration.findings)
     lines = [
+        *([] if both is None else [f"# Mount and compass: {printable(str(both))}.", "#"]),
         f"# Calibration from trial {printable(calibration.trial)}.",
         "#",
         "# Angles: roll about the forward axis (positive starboard down), pitch about the",

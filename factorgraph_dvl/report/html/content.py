@@ -34,6 +34,10 @@ class Result:
         Contents of crosscheck.json and deadreckon.json, where they exist.
     halves : mapping of str to sequence, optional
         Columns of halves.csv.
+    check : mapping of str to object, optional
+        Content of check.json: numbers before and after calibration.
+    check_table : mapping of str to ndarray, optional
+        Columns of check.parquet, at M times.
     redacted : bool, default False
         Leave out absolute positions, names of trials, and names of files.
     """
@@ -45,6 +49,8 @@ class Result:
     crosscheck: Mapping[str, Any] = field(default_factory=dict)
     dead_reckoning: Mapping[str, Any] = field(default_factory=dict)
     halves: Mapping[str, Any] = field(default_factory=dict)
+    check: Mapping[str, Any] = field(default_factory=dict)
+    check_table: Mapping[str, Any] = field(default_factory=dict)
     redacted: bool = False
 
     @property

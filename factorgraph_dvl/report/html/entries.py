@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from factorgraph_dvl.analysis.instrument_terms import instrument_of
-from factorgraph_dvl.report.entries import TITLE, conventions, entries_table
+from factorgraph_dvl.report.entries import TITLE, conventions, entries_table, sum_with_compass
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import Html, both, described, element, joined, paragraph
 from factorgraph_dvl.report.html.vessel import vessel_drawing
@@ -18,6 +18,8 @@ def entries_content(result: Result) -> Iterator[Html]:
         yield paragraph(both("Enter nothing: this result must not be used."))
         return
     terms = instrument_of(result.solution)
+    if (found := sum_with_compass(result.solution.findings)) is not None:
+        yield paragraph(joined(both("Mount and compass:"), both(str(found), found.chinese)))
     yield described(entries_table(terms, result.maker), label=TITLE)
     yield paragraph(joined(*map(both, conventions(terms))))
     yield vessel_drawing(terms, result.solution, result.run.get("settings", {}))

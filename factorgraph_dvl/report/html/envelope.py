@@ -14,6 +14,9 @@ from factorgraph_dvl.geometry.vectors import Array
 _INTERVALS = 1200
 # A record without a value for this many intervals has a gap. Chosen: one may be empty by chance.
 _GAP_INTERVALS = 4.0
+# A line that goes up and down more often than this is a block; as a band it has so many
+# intervals. Chosen: a period takes three pixels of a plot, and an interval takes three too.
+_MOST_SWINGS, _BAND_INTERVALS = 150.0, 300
 _LARGEST = 32767
 _MISSING = -32768
 
@@ -41,18 +44,19 @@ def envelope(time: Array, values: Array) -> Envelope:
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        In order.
+        Times in order.
     values : ndarray, shape (M, d)
         Values; nan where there are none.
     """
     if time.size == 0:
         return Envelope(time, values, values)
-    interval = float(time[-1] - time[0]) / _INTERVALS
-    if time.size <= 2 * _INTERVALS:
+    intervals = _BAND_INTERVALS if is_dense(values) else _INTERVALS
+    interval = float(time[-1] - time[0]) / intervals
+    if time.size <= 2 * intervals:
         first = np.arange(time.size)
         longest = _GAP_INTERVALS * max(interval, float(np.median(np.diff(time, append=time[-1]))))
     else:
-        edges = np.searchsorted(time, time[0] + interval * np.arange(_INTERVALS))
+        edges = np.searchsorted(time, time[0] + interval * np.arange(intervals))
         first = np.unique(edges)
         longest = _GAP_INTERVALS * interval
     low = np.fmin.reduceat(values, first, axis=0)
@@ -65,6 +69,17 @@ def envelope(time: Array, values: Array) -> Envelope:
         np.insert(low, gaps, blank, axis=0),
         np.insert(high, gaps, blank, axis=0),
     )
+
+
+def is_dense(values: Array) -> bool:
+    """Return whether a line through a component of values (M, d) would be a solid block."""
+    swings = np.nansum(np.abs(np.diff(values, axis=0)), axis=0)
+    known = np.isfinite(values)
+    span = np.where(known, values, -np.inf).max(axis=0) - np.where(known, values, np.inf).min(
+        axis=0
+    )
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return bool(np.any(0.5 * swings / span > _MOST_SWINGS))
 
 
 def packed_times(time: Array) -> dict[str, Any]:

@@ -13,6 +13,11 @@ from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.quality.notation import fixed, with_std
 from factorgraph_dvl.quality.texts import component_names
 from factorgraph_dvl.report.html.certificate import certificate_section
+from factorgraph_dvl.report.html.check import (
+    check_plots,
+    check_section,
+    dead_reckoning_section,
+)
 from factorgraph_dvl.report.html.content import Result, redact
 from factorgraph_dvl.report.html.markup import (
     Cell,
@@ -34,7 +39,6 @@ from factorgraph_dvl.report.html.sections import (
     calibration_section,
     clock_section,
     crosscheck_section,
-    dead_reckoning_section,
     deviation_plots,
     flat_settings,
     halves_section,
@@ -76,10 +80,12 @@ def report_page(result: Result, *, redacted: bool = False) -> str:
     motion = motion_plots(result, segments)
     deviations = deviation_plots(result, segments)
     residuals = residual_plots(result)
+    checks = check_plots(result)
     note = "Residual = predicted − measured, in units of its own σ. Dashed: ±3."
     sections = [
         verdict_section(result),
         calibration_section(result) if result.solution.estimates else None,
+        check_section(result, checks),
         track_section(result),
         titled(motion, result.start, "Motion", "motion", shading_legend(segments)),
         titled(
@@ -106,7 +112,7 @@ def report_page(result: Result, *, redacted: bool = False) -> str:
         certificate_section(result),
         settings_section(result),
     ]
-    plots = [*motion, *deviations, *residuals]
+    plots = [*checks, *motion, *deviations, *residuals]
     data = [p.data(result.start) for p in plots]
     shown = [s for s in sections if s is not None]
     return whole_page("Calibration report", result.trial, shown, data, redacted=redacted)
@@ -118,7 +124,7 @@ def comparison_page(results: Sequence[Result], *, redacted: bool = False) -> str
     Parameters
     ----------
     results : sequence of Result
-        At least two, with different names; the others are compared with the first.
+        Results; at least two, with different names; the others are compared with the first.
     redacted : bool, default False
         Leave out absolute positions, names of trials, and names of files.
     """

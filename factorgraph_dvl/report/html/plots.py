@@ -11,7 +11,7 @@ import numpy as np
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.texts import chinese
-from factorgraph_dvl.report.html.envelope import envelope, packed, packed_times
+from factorgraph_dvl.report.html.envelope import Envelope, envelope, packed, packed_times
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
@@ -43,11 +43,11 @@ class Plot:
     title : str
         What is shown, as `words` lists it.
     unit : str
-        Of the values; empty if they have none.
+        Unit of the values; empty if they have none.
     names : sequence of str
         Names of the d components.
     time : ndarray, shape (M,), s
-        In order.
+        Times in order.
     values : ndarray, shape (M, d)
         Values; nan where there are none.
     segments : sequence of Segment, optional
@@ -60,6 +60,11 @@ class Plot:
         What it is about, before the title: a measurement or a parameter.
     log : bool, default False
         Draw on a logarithmic axis; values that are not above 0 are left out.
+    cycle : float, optional
+        Values that differ by this are the same, such as angles; nan = none. The values are
+        unwrapped, and shown in a range in which they rarely pass from end to end.
+    axis : str, optional
+        Title of the vertical axis, as `words` lists it; by default `title`.
     """
 
     key: str
@@ -73,10 +78,12 @@ class Plot:
     band: float = np.nan
     about: str = ""
     log: bool = False
+    cycle: float = np.nan
+    axis: str = ""
 
     def data(self, start: float) -> dict[str, Any]:
         """Return what the script draws, with times from `start`, s."""
-        found = envelope(self.time - start, self._drawn())
+        found = self._wrapped(envelope(self.time - start, self._drawn()))
         limited = np.isfinite(self.limit)
         clip = self.limit if limited else np.inf
         series = []
@@ -98,6 +105,8 @@ class Plot:
             "key": self.key,
             "height": _LOW if limited else _HIGH,
             "unit": self.unit,
+            "label": self._label(self.axis or self.title),
+            "label_zh": self._label(chinese(self.axis or self.title)),
             "log": self.log,
             "time": packed_times(found.time),
             "series": series,
@@ -110,6 +119,27 @@ class Plot:
             ],
         }
 
+    def _label(self, title: str) -> str:
+        return f"{title}, {self.unit}" if self.unit else title
+
+    def _wrapped(self, found: Envelope) -> Envelope:
+        """Return an envelope in one cycle, with a gap where it passes from end to end."""
+        if not np.isfinite(self.cycle):
+            return found
+        candidates = []
+        for least in (0.0, -0.5 * self.cycle):
+            turn = np.floor((found.low - least) / self.cycle)
+            passes = np.floor((found.high - least) / self.cycle) != turn
+            down = np.where(passes, np.nan, self.cycle * turn)
+            # Where the next interval is in another cycle, no line must lead there. The gap is
+            # wider than a pixel.
+            jump = np.flatnonzero(np.any(np.diff(turn, axis=0) != 0.0, axis=1))
+            for near in (-1, 0, 1):
+                down[np.clip(jump + near, 0, len(down) - 1)] = np.nan
+            candidates.append((passes.sum() + jump.size, down))
+        down = min(candidates, key=lambda c: c[0])[1]
+        return Envelope(found.time, found.low - down, found.high - down)
+
     def _drawn(self) -> Array:
         """Return what is drawn; the logarithms of base 10 on a logarithmic axis."""
         if not self.log:
@@ -118,8 +148,7 @@ class Plot:
 
     def html(self, start: float) -> Html:
         """Return the place of the plot in the page, its legend, and a table of its values."""
-        unit = f", {self.unit}" if self.unit else ""
-        english, own = f"{self.title}{unit}", f"{chinese(self.title)}{unit}"
+        english, own = self._label(self.title), self._label(chinese(self.title))
         if self.about:
             english, own = f"{self.about}: {english}", f"{chinese(self.about)}：{own}"
         title = both(english, own)
@@ -167,13 +196,12 @@ class Plot:
 
     def _table(self, start: float) -> Html:
         rows = np.unique(np.linspace(0, self.time.size - 1, _ROWS).astype(int))
-        cells = [
-            [f"{self.time[k] - start:.1f}", *(_number(v) for v in self.values[k])] for k in rows
-        ]
-        known = [bool(np.isfinite(column).any()) for column in self.values.T]
+        values = np.mod(self.values, self.cycle) if np.isfinite(self.cycle) else self.values
+        cells = [[f"{self.time[k] - start:.1f}", *(_number(v) for v in values[k])] for k in rows]
+        known = [bool(np.isfinite(column).any()) for column in values.T]
         for name, reduce in (("least", np.nanmin), ("largest", np.nanmax)):
             found = [
-                _number(float(reduce(self.values[:, i]))) if known[i] else "–"
+                _number(float(reduce(values[:, i]))) if known[i] else "–"
                 for i in range(len(known))
             ]
             cells.append([name, *found])

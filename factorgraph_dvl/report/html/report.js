@@ -37,11 +37,14 @@
     root.dataset.lang = to;
     root.lang = to === "zh" ? "zh-Hans" : "en";
     document.querySelectorAll("[data-zh]").forEach((e) => { e.setAttribute("aria-label", to === "zh" ? e.dataset.zh : e.dataset.en); });
+    plots.forEach((u) => u.redraw(false, true));
   };
   document.getElementById("language").addEventListener("click", () => setLanguage(language === "en" ? "zh" : "en"));
   setLanguage((navigator.language || "en").startsWith("zh") ? "zh" : "en");
 
   const together = uPlot.sync("time");
+  const font = "12px system-ui, 'Noto Sans', 'Noto Sans CJK SC', sans-serif";
+  const label = (en, zh) => () => (language === "zh" ? zh : en);
   const make = (plot) => {
     const place = document.getElementById(plot.key);
     const readout = place.parentNode.querySelector(".readout");
@@ -67,7 +70,7 @@
       width: width(), height: plot.height, legend: { show: false }, bands, series,
       cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false } },
       scales: { x: { time: false }, y: plot.log ? { distr: 3, range: (u, min, max) => [min / 1.3, max * 1.3] } : plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
-      axes: [{ size: 34, space: 60 }, { size: 72, values: (_, ticks) => ticks.map(short), ...(plot.log ? { splits: decades, filter: (_, ticks) => ticks } : {}) }],
+      axes: [{ size: 34, space: 60, label: label("time, s", "时间，s"), labelSize: 20, labelFont: font, font }, { size: 60, label: label(plot.label, plot.label_zh), labelSize: 20, labelFont: font, font, values: (_, ticks) => ticks.map(short), ...(plot.log ? { splits: decades, filter: (_, ticks) => ticks } : {}) }],
       hooks: {
         drawClear: [(u) => {
           for (const [from, to, label] of plot.shade) {

@@ -17,7 +17,7 @@ from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.quality.finding import Finding
-from factorgraph_dvl.quality.notation import fixed, in_words, with_std
+from factorgraph_dvl.quality.notation import fixed, in_words
 from factorgraph_dvl.quality.texts import chinese_cause, component_names
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.html.content import Result
@@ -39,6 +39,7 @@ from factorgraph_dvl.report.html.markup import (
     table,
 )
 from factorgraph_dvl.report.html.plots import Plot
+from factorgraph_dvl.report.html.steps import steps_drawing
 from factorgraph_dvl.report.html.track import track_svg
 from factorgraph_dvl.report.tables import calibration_table, posterior_table
 from factorgraph_dvl.solution import Solution
@@ -60,13 +61,6 @@ _MANOEUVRES = {
     "turns": "turns to both sides at 3 deg/s",
     "pitching": "pitching by 10 deg, up and down",
 }
-_ERRORS = (
-    ("end_point_error_m", "end point error, m"),
-    ("end_point_percent", "end point error, % of distance"),
-    ("global_error_m", "largest error, m"),
-    ("rms_error_m", "RMS error, m"),
-    ("distance_m", "distance, m"),
-)
 
 
 _FOR_EXPERTS = (
@@ -193,7 +187,7 @@ def motion_plots(result: Result, segments: Sequence[Segment]) -> list[Plot]:
     heading = np.unwrap(np.nan_to_num(t.rph[:, 2]))[:, None] / DEG
     plots = [
         Plot("speed", "Speed over ground", "m/s", ["speed"], t.time, speed, segments),
-        Plot("heading", "Heading", "deg", ["heading"], t.time, heading, segments),
+        Plot("heading", "Heading", "deg", ["heading"], t.time, heading, segments, cycle=360.0),
     ]
     if np.nanmax(np.abs(t.rph[:, :2]), initial=0.0) > 0.0:
         rp = t.rph[:, :2] / DEG
@@ -244,7 +238,7 @@ def budget_section(result: Result) -> Section | None:
     if len(causes) > len(shown):
         swatch = element("span", class_="swatch", style=f"background:{_REST}")
         legend.append(element("li", swatch, both("all others")))
-    rows, numbers = [], []
+    rows, known = [], []
     for i, name in enumerate(solution.order):
         if std[i] <= 0.0:
             continue
@@ -263,7 +257,7 @@ def budget_section(result: Result) -> Section | None:
                 both(named, own),
             ]
         )
-        numbers.append([component_cell(name), unit, *(f"{float(c.adds[i]):.2g}" for c in causes)])
+        known.append(i)
     header = [both(x) for x in ("parameter", "σ now", "share of the variance", "largest causes")]
     return section(
         "Error budget",
@@ -273,14 +267,19 @@ def budget_section(result: Result) -> Section | None:
         folded(
             "All numbers",
             table(
-                [both("parameter"), both("unit"), *map(_cause, causes)],
-                numbers,
+                [both("cause"), *(_with_unit(solution.order[i]) for i in known)],
+                [[_cause(c), *(f"{float(c.adds[i]):.2g}" for i in known)] for c in causes],
                 label="All numbers",
-                numeric=range(2, 2 + len(causes)),
+                numeric=range(1, 1 + len(known)),
             ),
         ),
         key="budget",
     )
+
+
+def _with_unit(component: str) -> Html:
+    unit = component_names(component)[2]
+    return joined(component_cell(component), unit, by=", ") if unit else component_cell(component)
 
 
 def _cause(cause: Cause) -> Html:
@@ -307,7 +306,9 @@ def observability_section(result: Result, segments: Sequence[Segment]) -> Sectio
     cells: list[Cell] = []
     view = marginals(solution.estimates, solution.covariance, solution.limits)
     if view is not None:
-        cells.append(described(posterior_table(view), label="Observability"))
+        # Values and grades are in the table of the calibration.
+        table_ = posterior_table(view).without("value ± σ", "grade")
+        cells.append(described(table_, label="Observability"))
         if view.sentences:
             cells.append(element("h3", both("Directions that the data hardly determine")))
             cells.append(items(list(map(said, view.sentences))))
@@ -429,30 +430,21 @@ def residual_tables(result: Result) -> list[Cell]:
 
 
 def clock_section(result: Result) -> Section:
-    """Return offsets and rates of the sensors' clocks."""
+    """Return what the offsets of clocks mean, and what was found of clocks."""
     solution = result.solution
-    rows: list[list[Cell]] = []
-    for e in solution.estimates:
-        if e.spec.stem.endswith(("time_offset", "clock_rate")):
-            rows += [
-                [component_cell(name), with_std(float(value), float(std)),
-                 component_names(name)[2], f"{prior:.3g}"]
-                for name, value, std, prior in zip(
-                    e.component_names, e.value, e.std, e.prior_std, strict=True
-                )
-            ]  # fmt: skip
+    estimated = any(
+        e.spec.stem.endswith(("time_offset", "clock_rate")) for e in solution.estimates
+    )
     about = [
         f
         for f in solution.findings
         if f.severity != "ok" and ("clock" in f.code or f.code in ("leap_seconds", "local_time"))
     ]
-    cells: list[Cell] = []
-    if rows:
-        text = "Stamps of a sensor = time of the IMU + offset. A positive offset is a late stamp."
-        header = [both(x) for x in ("parameter", "value ± σ", "unit", "before the trial")]
-        cells = [paragraph(both(text)), table(header, rows, label="Clocks", numeric=(1, 3))]
-    else:
-        cells = [paragraph(both("No clock was estimated."))]
+    text = (
+        "Stamps of a sensor = time of the IMU + offset. A positive offset is a late stamp. The "
+        "values are in the table of the calibration."
+    )
+    cells: list[Cell] = [paragraph(both(text if estimated else "No clock was estimated."))]
     if about:
         cells.append(items([joined(_what(f), _code(f)) for f in about]))
     return section("Clocks", *cells, key="clocks")
@@ -499,21 +491,6 @@ def crosscheck_section(result: Result) -> Section | None:
 
 def _side(check: Mapping[str, Any], side: str) -> str:
     return f"{side.upper()}: {check.get(side, {}).get('solver', '')}"
-
-
-def dead_reckoning_section(result: Result) -> Section | None:
-    """Return errors of dead reckoning before and after calibration, if they were measured."""
-    found = result.dead_reckoning
-    if not found or "end_point_error_m" not in found:
-        return None
-    before = found.get("uncalibrated", {})
-    rows = [[both(name), _text(before.get(key)), _text(found.get(key))] for key, name in _ERRORS]
-    header = [Html(""), both("before calibration"), both("after calibration")]
-    return section(
-        "Dead reckoning",
-        table(header, rows, label="Dead reckoning", numeric=(1, 2)),
-        key="dead-reckoning",
-    )
 
 
 def _text(value: Any) -> str:
@@ -570,6 +547,7 @@ def _solver_steps(steps: Sequence[Mapping[str, Any]]) -> Iterator[Html]:
     yield folded(
         label,
         paragraph(both(text)),
+        *([steps_drawing([float(s["objective"]) for s in steps])] if len(steps) > 1 else []),
         table([both(h) for h in header], rows, label=label, numeric=(0, 2, 3, 4)),
     )
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms
-from factorgraph_dvl.geometry.rotations import frd_from_body
+from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.html.markup import (
@@ -23,35 +20,26 @@ from factorgraph_dvl.report.html.markup import (
     round_step,
     tspans,
 )
-from factorgraph_dvl.sensors.gnss import LEVER_ARM as GNSS_LEVER_ARM
+from factorgraph_dvl.report.vessel import (
+    AXES,
+    LEGEND,
+    SIGMAS,
+    VIEWS,
+    Place,
+    axes_of,
+    beams,
+    places_of,
+)
 from factorgraph_dvl.solution import Solution
 
 # Size of each drawing, and what is left free around the instruments, in its own units.
 _SIZE, _MARGIN = 360.0, 124.0
 # Length of the DVL's axes and beams, in units of the drawing. Chosen: their directions are seen.
 _AXIS, _BEAM = 54.0, 76.0
-# Beams of a Janus DVL, by direction from its axis and from ahead, deg.
-_SLANT, _AZIMUTHS = 30.0, (45.0, 135.0, 225.0, 315.0)
 # Points that are closer have one label, in units of the drawing.
 _APART = 16.0
 # Chosen: a vessel is drawn at least so wide, m, and an ellipse widens it at most so many times.
 _LEAST_M, _WIDEST = 0.5, 1.0
-# Standard deviations of an ellipse.
-_SIGMAS = 2.0
-# What is seen to the right and upward, of forward, starboard, down.
-_VIEWS = {
-    "From above": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
-    "From the side, seen from starboard": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
-}
-
-
-@dataclass(frozen=True)
-class _Place:
-    """An instrument: its name, its place forward, starboard, down, m, and its covariance."""
-
-    name: str
-    place: Array
-    covariance: Array
 
 
 def vessel_drawing(
@@ -64,58 +52,34 @@ def vessel_drawing(
     terms : InstrumentTerms
         Calibration of the DVL.
     solution : Solution
-        With the antenna's lever arm, if it was estimated.
+        Solution with the antenna's lever arm, if it was estimated.
     settings : mapping of str to object
-        Of the trial, by section: the antenna's lever arm, if it was not.
+        Settings of the trial, by section.
     """
-    places = [
-        _Place(terms.origin, np.zeros(3), np.zeros((3, 3))),
-        *_antenna(terms, solution, settings),
-        _Place("DVL", terms.lever_arm, terms.lever_arm_covariance),
-    ]
-    # Columns are the axes of the DVL: forward, starboard, down.
-    axes = Rotation.from_euler("ZYX", terms.dvl_in_body["ZYX"].value[::-1], degrees=True)
+    places, axes = places_of(terms, solution, settings), axes_of(terms)
     figures = [
-        element("figure", _view(view, places, axes.as_matrix(), title),
+        element("figure", _view(view, places, axes, title),
                 element("figcaption", both(title)))
-        for title, view in _VIEWS.items()
+        for title, view in VIEWS.items()
     ]  # fmt: skip
     return joined(
         element("div", *figures, class_="vessel"),
         paragraph(
             joined(
                 both(f"Reference point: {terms.origin}."),
-                both("Arrows: axes of the DVL. Dashed: four beams at 30° from its axis."),
-                both("Ellipses: 2 σ, to scale, so that small ones hide behind their points."),
+                *map(both, LEGEND),
             )
         ),
     )
 
 
-def _antenna(
-    terms: InstrumentTerms, solution: Solution, settings: Mapping[str, Any]
-) -> Iterator[_Place]:
-    if terms.origin == ANTENNA or "gnss" not in settings:
-        return
-    frd = frd_from_body(solution.body_axes)
-    order = list(solution.order)
-    for e in solution.estimates:
-        if e.name == GNSS_LEVER_ARM:
-            rows = [order.index(name) for name in e.component_names]
-            covariance = frd @ solution.covariance[np.ix_(rows, rows)] @ frd.T
-            yield _Place(ANTENNA, frd @ e.value, covariance)
-            return
-    stated = np.array(settings["gnss"].get("lever_arm_m", np.zeros(3)), dtype=float)
-    yield _Place(ANTENNA, frd @ stated, np.zeros((3, 3)))
-
-
-def _view(view: Array, places: Sequence[_Place], axes: Array, title: str) -> Html:
+def _view(view: Array, places: Sequence[Place], axes: Array, title: str) -> Html:
     """Return a drawing of one view (2, 3): what is seen to the right, and upward."""
     points = np.stack([view @ p.place for p in places])
     low, high = points.min(axis=0), points.max(axis=0)
     span = max(float((high - low).max()), _LEAST_M)
     spread = [np.sqrt(np.maximum(np.diag(view @ p.covariance @ view.T), 0.0)) for p in places]
-    reach = np.minimum(_SIGMAS * np.stack(spread), _WIDEST * span)
+    reach = np.minimum(SIGMAS * np.stack(spread), _WIDEST * span)
     low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
     span = max(float((high - low).max()), span)
     scale = (_SIZE - 2.0 * _MARGIN) / span
@@ -131,7 +95,7 @@ def _view(view: Array, places: Sequence[_Place], axes: Array, title: str) -> Htm
         f'<rect class="ground" width="{_SIZE:g}" height="{_SIZE:g}"/>',
         _bow(view),
         *(
-            _ellipse(xy, _SIGMAS * scale, view @ p.covariance @ view.T)
+            _ellipse(xy, SIGMAS * scale, view @ p.covariance @ view.T)
             for xy, p in zip(at, places, strict=True)
         ),
         f'<path class="arm" d="M{_xy(at[0])} L{_xy(at[-1])}"/>',
@@ -146,14 +110,10 @@ def _view(view: Array, places: Sequence[_Place], axes: Array, title: str) -> Htm
 
 def _dvl(at: Array, view: Array, axes: Array) -> Iterator[str]:
     """Yield axes and beams of the DVL, as they are seen."""
-    for azimuth in _AZIMUTHS:
-        level = np.sin(_SLANT * DEG)
-        beam = [
-            level * np.cos(azimuth * DEG), level * np.sin(azimuth * DEG), np.cos(_SLANT * DEG),
-        ]  # fmt: skip
+    for beam in beams():
         end = at + _BEAM * (view @ axes @ beam) * [1.0, -1.0]
         yield f'<path class="beam" d="M{_xy(at)} L{_xy(end)}"/>'
-    for k, name in enumerate(("forward", "starboard", "down")):
+    for k, name in enumerate(AXES):
         seen = (view @ axes[:, k]) * [1.0, -1.0]
         length = float(np.hypot(*seen))
         # An axis that points nearly at the reader hides behind its point.

@@ -53,7 +53,7 @@ def live_view(
     good_since : float, optional
         Time from which no standard deviation exceeds its limit, s; None = some do.
     verdict : Verdict, optional
-        On what is known now.
+        Verdict on what is known now.
     """
     table = Table()
     table.add_column("parameter")

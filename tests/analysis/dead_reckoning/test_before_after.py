@@ -256,9 +256,7 @@ def folder(tmp_path_factory):
 
 def test_command_writes_its_folder(run, folder):  # noqa: F811
     trial = folder / "trial"
-    result = run(
-        "deadreckon", trial, "--calibration", trial / "truth.json", "--out", folder / "out"
-    )
+    result = run("deadreckon", trial, trial / "truth.json", "--out", folder / "out")
     assert result.code == 0, result.err
     assert "end point" in result.out
     names = sorted(p.name for p in (folder / "out").iterdir())
@@ -306,7 +304,7 @@ def test_command_takes_the_attitude_of_a_solution_or_the_reference(run, folder, 
     for source in ("reference", str(tmp_path / "solution")):
         out = tmp_path / ("out-" + source.rpartition("/")[2])
         result = run(
-            "deadreckon", folder / "trial", "--calibration", folder / "trial" / "truth.json",
+            "deadreckon", folder / "trial", folder / "trial" / "truth.json",
             "--out", out, "--attitude", source, "--no-figures",
         )  # fmt: skip
         assert result.code == 0, result.err
@@ -324,7 +322,7 @@ def test_a_score_that_ends_before_the_track_says_so(run, folder, tmp_path):  # n
     short = Reference(r.time[early], r.geodetic[early], r.velocity[early], r.rph[early])
     save_trial(replace(trial, reference=short), tmp_path / "trial")
     result = run(
-        "deadreckon", tmp_path / "trial", "--calibration", folder / "trial" / "truth.json",
+        "deadreckon", tmp_path / "trial", folder / "trial" / "truth.json",
         "--out", tmp_path / "out", "--no-figures",
     )  # fmt: skip
     assert result.code == 0, result.err
@@ -334,10 +332,16 @@ def test_a_score_that_ends_before_the_track_says_so(run, folder, tmp_path):  # n
 
 
 BAD = {
-    "no such folder": (("--attitude", "nowhere"), "there is no folder nowhere"),
-    "align with reference": (("--attitude", "reference", "--align", "60"), "--align"),
-    "no file": (("--calibration", "nowhere.json"), "nowhere.json"),
-    "no calibration": (("--calibration", "TRIAL/trial.yaml"), "trial.yaml"),
+    "no such folder": (
+        ("TRIAL/truth.json", "--attitude", "nowhere"),
+        "there is no folder nowhere",
+    ),
+    "align with reference": (
+        ("TRIAL/truth.json", "--attitude", "reference", "--align", "60"),
+        "--align",
+    ),
+    "no file": (("nowhere.json",), "nowhere.json"),
+    "no calibration": (("TRIAL/trial.yaml",), "trial.yaml"),
 }
 
 
@@ -346,9 +350,7 @@ def test_bad_usage_leaves_nothing(run, folder, tmp_path, case):  # noqa: F811
     options, message = BAD[case]
     trial = folder / "trial"
     given = [o.replace("TRIAL", str(trial)) for o in options]
-    if "--calibration" not in given:
-        given += ["--calibration", str(trial / "truth.json")]
-    result = run("deadreckon", trial, "--out", tmp_path / "out", *given)
+    result = run("deadreckon", trial, *given, "--out", tmp_path / "out")
     assert result.code == 2
     assert message in result.err
     assert not (tmp_path / "out").exists()
@@ -367,7 +369,7 @@ def test_without_gnss_the_reference_gives_the_attitude_and_initial_the_start(run
     trial = simulate(scenario(gnss=None, trial={"initial": initial}), 0)
     save_trial(trial, tmp_path / "trial")
     result = run(
-        "deadreckon", tmp_path / "trial", "--calibration", tmp_path / "trial" / "truth.json",
+        "deadreckon", tmp_path / "trial", tmp_path / "trial" / "truth.json",
         "--out", tmp_path / "out", "--no-figures",
     )  # fmt: skip
     assert result.code == 0, result.err

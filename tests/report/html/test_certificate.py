@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from pathlib import Path
 
@@ -58,6 +59,14 @@ def test_the_page_prints_the_certificate(trial: Path, tmp_path: Path, run: Run) 
     for name in ("trial.yaml", "imu.csv", "gnss.csv", "dvl.csv"):
         digest = hashlib.sha256((trial / name).read_bytes()).hexdigest()
         assert re.search(rf">{name}</th><td><code>{digest}</code>", certificate)
+    check = json.loads((out / "check.json").read_text())
+    assert check["data"] in ("second half", "same data")
+    assert max(check["residual_rms_m_s"]["after"]) < max(check["residual_rms_m_s"]["before"])
+    assert 'id="check-title"' in page
+    # For paper, too.
+    assert run("report", out, "--pdf").code == 0
+    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
+    assert run("report", out, out, "--pdf").code == 2
     # The page can be made again.
     assert run("report", out).code == 0
     assert certificate in (out / "report.html").read_text(encoding="utf-8")

@@ -20,6 +20,8 @@ from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.texts import catalogue, chinese_cause
 from factorgraph_dvl.report.html.envelope import envelope
 from factorgraph_dvl.report.html.page import UPLOT, comparison_page, report_page
+from factorgraph_dvl.report.html.plots import Plot
+from factorgraph_dvl.report.html.steps import steps_drawing
 from factorgraph_dvl.sensors.parameters import ParameterSpec
 
 # Of the files in the package `uplot` 1.6.32 as npm serves it, whose shasum is
@@ -70,7 +72,7 @@ def test_the_verdict_comes_first_with_what_to_do(page: str) -> None:
 
 def test_every_plot_has_a_description_and_a_table(page: str) -> None:
     plots = data_of(page)["plots"]
-    assert len(plots) == 4 + 3 + 3
+    assert len(plots) == 3 + 4 + 3 + 3
     for plot in plots:
         (canvas,) = re.findall(rf'<div [^>]*id="{plot["key"]}"[^>]*>', page)
         assert 'role="img"' in canvas
@@ -209,3 +211,59 @@ def test_results_side_by_side() -> None:
 
 def test_the_same_result_makes_the_same_bytes() -> None:
     assert report_page(build_result()) == report_page(build_result())
+
+
+def drawn(plot: Any, which: str) -> Array:
+    """Return the values of a series of a plot, nan where there is a gap."""
+    series = plot["series"][0]
+    steps = np.frombuffer(b64decode(series.get(which, series["low"])), dtype="<i2").astype(float)
+    return np.where(steps == -32768, np.nan, series["offset"] + series["step"] * steps)
+
+
+def test_every_axis_has_a_title_with_its_unit(page: str) -> None:
+    for plot in data_of(page)["plots"]:
+        assert plot["label"]
+        assert plot["label_zh"]
+        assert not plot["unit"] or plot["label"].endswith(f", {plot['unit']}")
+
+
+@pytest.mark.parametrize(("middle", "least"), [(0.0, -180.0), (180.0, 0.0), (540.0, 0.0)])
+def test_headings_are_in_one_turn_and_do_not_jump(middle: float, least: float) -> None:
+    time = np.arange(0.0, 600.0, 0.1)
+    swing = (middle + 5.0 * np.sin(time))[:, None]
+    plot = Plot("heading", "Heading", "deg", ["heading"], time, swing, cycle=360.0).data(0.0)
+    low, high = drawn(plot, "low"), drawn(plot, "high")
+    assert np.isfinite(low).all()
+    assert low.min() >= least
+    assert high.max() < least + 360.0
+    assert np.ptp(np.concatenate([low, high])) < 10.1
+
+
+def test_a_circle_has_a_gap_where_its_heading_starts_anew() -> None:
+    time = np.arange(0.0, 600.0, 0.1)
+    turn = (0.9 * time + 10.0)[:, None]
+    plot = Plot("heading", "Heading", "deg", ["heading"], time, turn, cycle=360.0).data(0.0)
+    low = drawn(plot, "low")
+    steps = np.abs(np.diff(low))
+    assert np.isnan(low).any()
+    assert np.nanmax(steps) < 2.0
+    assert np.ptp(low[np.isfinite(low)]) > 350.0
+
+
+def test_a_dense_signal_is_a_band_and_a_slow_one_a_line() -> None:
+    time = np.arange(0.0, 500.0, 0.25)
+    dense = envelope(time, np.sin(2.0 * np.pi * time)[:, None])
+    assert dense.time.size <= 301
+    assert np.all(dense.high - dense.low > 1.9)
+    slow = envelope(time, np.sin(2.0 * np.pi * time / 100.0)[:, None])
+    np.testing.assert_array_equal(slow.low, slow.high)
+
+
+def test_the_steps_are_drawn_where_they_stand() -> None:
+    text = steps_drawing([100.0, 10.0, 1.0, 0.0]).text
+    height = [float(y) for y in re.findall(r'<circle cx="[\d.]+" cy="([\d.]+)"', text)]
+    # Each factor of ten is as high, and the last is at the bottom.
+    falls = np.diff(height)
+    assert falls[0] == pytest.approx(falls[1], abs=1.0)
+    assert height[-1] == max(height)
+    assert steps_drawing([5.0]).text.count("<circle") == 1

@@ -107,7 +107,7 @@ class Raw(NamedTuple):
     topic, kind : str
         Name and type, `package/msg/Name`.
     time : int
-        Of recording, ns since 1970.
+        Time of recording, ns since 1970.
     data : bytes
         Content.
     decode : callable

@@ -38,7 +38,7 @@ class Channel(NamedTuple):
     definition : str
         Text of the type's definition.
     encoding : str
-        Of the definition: `ros1msg`, `ros2msg`, `ros2idl`.
+        Encoding of the definition: `ros1msg`, `ros2msg`, `ros2idl`.
     """
 
     topic: str

@@ -1,0 +1,93 @@
+"""The vessel from above and from the side, to scale, in axes of Matplotlib."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse
+
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.report.figures.drawing import DARK, GREY, PALE, SMALL
+from factorgraph_dvl.report.vessel import AXES, SIGMAS, Place, beams
+
+# Chosen: a vessel is drawn at least so wide, m; free space, axes and beams, as shares of that.
+_LEAST_M, _FREE, _AXIS, _BEAM = 0.5, 0.9, 0.3, 0.45
+_COLOURS = ("#b34700", "#00694b", "#332288")
+
+
+def draw_vessel(
+    ax: Axes,
+    view: Array,
+    places: Sequence[Place],
+    axes: Array,
+    said: Callable[[str], str] = str,
+) -> None:
+    """Draw a view of a vessel: its instruments, and the axes and beams of its DVL.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    view : ndarray, shape (2, 3)
+        What is seen to the right and upward, of forward, starboard, down.
+    places : sequence of Place
+        Instruments, the DVL last.
+    axes : ndarray, shape (3, 3)
+        Axes of the DVL, a column each, in forward, starboard, down.
+    said : callable, optional
+        Translates names.
+    """
+    points = np.stack([view @ p.place for p in places])
+    low, high = points.min(axis=0), points.max(axis=0)
+    span = max(float((high - low).max()), _LEAST_M)
+    middle, half = 0.5 * (low + high), (0.5 + _FREE) * span
+    box = ax.get_window_extent()
+    wide = half * max(float(box.width / box.height), 1.0)
+    tall = half * max(float(box.height / box.width), 1.0)
+    ax.set_xlim(middle[0] - wide, middle[0] + wide)
+    ax.set_ylim(middle[1] - tall, middle[1] + tall)
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_facecolor(PALE)
+    ax.spines[:].set_color(GREY)
+    ax.tick_params(labelsize=SMALL, length=3, color=GREY)
+    at = points[-1]
+    ax.plot(*np.stack([points[0], at]).T, color=GREY, lw=0.8, ls=":")
+    for beam in beams():
+        ax.plot(*np.stack([at, at + _BEAM * span * (view @ axes @ beam)]).T, color=GREY, lw=0.8,
+                ls="--")  # fmt: skip
+    for k, (name, colour) in enumerate(zip(AXES, _COLOURS, strict=True)):
+        seen = view @ axes[:, k]
+        # An axis that points nearly at the reader hides behind its point.
+        if np.hypot(*seen) < 0.25:
+            continue
+        end = at + _AXIS * span * seen
+        ax.annotate("", end, at, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.3})
+        side = seen[0] / np.hypot(*seen)
+        ax.annotate(
+            said(name), end, (6.0 * side, 6.0 * seen[1] / np.hypot(*seen)),
+            textcoords="offset points", color=colour, fontsize=SMALL, va="center",
+            ha="left" if side > 0.5 else "right" if side < -0.5 else "center",
+        )  # fmt: skip
+    for place, xy in zip(places, points, strict=True):
+        _draw_ellipse(ax, xy, view @ place.covariance @ view.T)
+    ax.plot(*points.T, "o", color=DARK, ms=4)
+    done: list[Array] = []
+    for place, xy in zip(places, points, strict=True):
+        lines = sum(float(np.hypot(*(xy - other))) < 0.08 * span for other in done)
+        done.append(xy)
+        ax.annotate(said(place.name), xy, xytext=(5, 5 + 9 * lines), textcoords="offset points",
+                    fontsize=SMALL, fontweight="bold", color=DARK)  # fmt: skip
+
+
+def _draw_ellipse(ax: Axes, at: Array, covariance: Array) -> None:
+    variance, turned = np.linalg.eigh(covariance)
+    if not np.isfinite(variance).all() or variance[1] <= 0.0:
+        return
+    b, a = 2.0 * SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+    angle = float(np.arctan2(turned[1, 1], turned[0, 1])) / DEG
+    ax.add_patch(
+        Ellipse((float(at[0]), float(at[1])), a, b, angle=angle, fc="#0072b233", ec="#0072b2")
+    )

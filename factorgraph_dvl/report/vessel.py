@@ -1,0 +1,104 @@
+"""Where the instruments of a vessel are, and how its DVL is turned: what drawings show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms
+from factorgraph_dvl.geometry.rotations import frd_from_body
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.gnss import LEVER_ARM as GNSS_LEVER_ARM
+from factorgraph_dvl.solution import Solution
+
+# Beams of a Janus DVL, by direction from its axis and from ahead, deg.
+_SLANT, _AZIMUTHS = 30.0, (45.0, 135.0, 225.0, 315.0)
+# Standard deviations of an ellipse.
+SIGMAS = 2.0
+# What is seen to the right and upward, of forward, starboard, down.
+VIEWS = {
+    "From above": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
+    "From the side, seen from starboard": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+}
+AXES = ("forward", "starboard", "down")
+LEGEND = (
+    "Arrows: axes of the DVL. Dashed: four beams at 30° from its axis.",
+    "Ellipses: 2 σ, to scale, so that small ones hide behind their points.",
+)
+
+
+@dataclass(frozen=True)
+class Place:
+    """An instrument of a vessel.
+
+    Parameters
+    ----------
+    name : str
+        Name to show.
+    place : ndarray, shape (3,), m
+        Place forward, starboard, down of the reference point.
+    covariance : ndarray, shape (3, 3), m²
+        Covariance of `place`.
+    """
+
+    name: str
+    place: Array
+    covariance: Array
+
+
+def places_of(
+    terms: InstrumentTerms, solution: Solution, settings: Mapping[str, Any]
+) -> list[Place]:
+    """Return reference point, antenna if there is another one, and DVL.
+
+    Parameters
+    ----------
+    terms : InstrumentTerms
+        Calibration of the DVL.
+    solution : Solution
+        Solution with the antenna's lever arm, if it was estimated.
+    settings : mapping of str to object
+        Settings of the trial, by section: the antenna's lever arm, if it was not.
+    """
+    return [
+        Place(terms.origin, np.zeros(3), np.zeros((3, 3))),
+        *_antenna(terms, solution, settings),
+        Place("DVL", terms.lever_arm, terms.lever_arm_covariance),
+    ]
+
+
+def axes_of(terms: InstrumentTerms) -> Array:
+    """Return the axes of the DVL, (3, 3), a column each, in forward, starboard, down."""
+    angles = terms.dvl_in_body["ZYX"].value[::-1]
+    return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+
+
+def beams() -> Iterator[Array]:
+    """Yield directions of four beams, (3,), in the axes of the DVL."""
+    level = np.sin(_SLANT * DEG)
+    for azimuth in _AZIMUTHS:
+        yield np.array(
+            [level * np.cos(azimuth * DEG), level * np.sin(azimuth * DEG), np.cos(_SLANT * DEG)]
+        )
+
+
+def _antenna(
+    terms: InstrumentTerms, solution: Solution, settings: Mapping[str, Any]
+) -> Iterator[Place]:
+    if terms.origin == ANTENNA or "gnss" not in settings:
+        return
+    frd = frd_from_body(solution.body_axes)
+    order = list(solution.order)
+    for e in solution.estimates:
+        if e.name == GNSS_LEVER_ARM:
+            rows = [order.index(name) for name in e.component_names]
+            covariance = frd @ solution.covariance[np.ix_(rows, rows)] @ frd.T
+            yield Place(ANTENNA, frd @ e.value, covariance)
+            return
+    stated = np.array(settings["gnss"].get("lever_arm_m", np.zeros(3)), dtype=float)
+    yield Place(ANTENNA, frd @ stated, np.zeros((3, 3)))
