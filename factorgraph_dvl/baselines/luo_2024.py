@@ -53,7 +53,7 @@ def as_printed(
     misalignment, scale, lever_arm : Parameter
         Misalignment, scale and lever arm with their priors; one scale for the three axes.
     factor : float, default 3000
-        Factor of R.
+        Factor on R.
     threshold : float, default 1 deg, rad
         Angle from which on data are rotated.
     """

@@ -109,7 +109,7 @@ COMMANDS = {
     ),
     "export": (
         "export.export",
-        "Export the trajectory of a solution, or the records of a trial.",
+        "Export the trajectory or the calibration of a solution, or the records of a trial.",
     ),
     "instrument": (
         "instrument.instrument",

@@ -14,7 +14,6 @@ from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
-from factorgraph_dvl.graph.bound_observation import SAME_TIME
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
@@ -63,6 +62,8 @@ _GROWTH, _RETRY = 1.5, 1.2
 _ATTITUDES = 50
 # Fewest nodes of a start; chosen.
 _FEWEST = 4
+# How far, s, two times count as one.
+_SAME_TIME = 2e-4
 
 
 class ReplayWithoutImu:
@@ -355,7 +356,7 @@ class ReplayWithoutImu:
         if self._pings is not None:
             own = own - batch.pings_late
         nodes = far_apart(last, own[(own > last) & (own <= latest)], LONGEST)
-        if latest - nodes[-1] > (SAME_TIME if end else LONGEST):
+        if latest - nodes[-1] > (_SAME_TIME if end else LONGEST):
             nodes = np.append(nodes, latest)
         return without_long_steps(nodes, LONGEST)[1:]
 

@@ -64,6 +64,11 @@ def started_from_stretch(
     values = settled.minimum.evaluation.parameters
     strengths = {process.name: process.sigma for process in found.processes}
     longer = (time[-1] - time[0]) / (time[last[first]] - time[first])
+    tilt = found.tilt
+    if tilt is not None:
+        # The stretch may estimate others: what it freed, or what its length does not show.
+        tilt = tilt.of(found.parameters, [p for p in prepared.parameters if p.estimated])
+        tilt = replace(tilt, gradient=longer * tilt.gradient, origin=values, hold=None)
     return replace(
         prepared,
         first_chain=replace(chain, density=density),
@@ -71,9 +76,7 @@ def started_from_stretch(
         processes=tuple(
             replace(p, sigma=strengths.get(p.name, p.sigma)) for p in prepared.processes
         ),
-        tilt=None
-        if found.tilt is None
-        else replace(found.tilt, gradient=longer * found.tilt.gradient, origin=values, hold=None),
+        tilt=tilt,
         noise_factors={
             label: factors
             for label, factors in found.noise_factors.items()

@@ -48,7 +48,8 @@ def spurious_information(
         Covariances of the states, in GTSAM's tangent space, where the parameters are exact: an
         error that all states share turns the Jacobians alike, and adds nothing.
     information : SquareRootInformation, optional
-        On all variables, which tells what these take up of it; by default nothing, an upper bound.
+        Information on all variables: these take up a part of it. By default none, an upper
+        bound.
 
     Returns
     -------
