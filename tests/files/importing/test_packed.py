@@ -45,7 +45,9 @@ def test_what_is_whole_in_a_damaged_one_is_kept(tmp_path):
     assert 20 < found.accounts[0].rows()[0][1] < 60
 
 
-@pytest.mark.parametrize("data", [b"", b"no gzip", gzip.compress(TEXT)[:12]])
+@pytest.mark.parametrize(
+    "data", [b"", b"no gzip", gzip.compress(TEXT)[:12]], ids=["empty", "other", "cut"]
+)
 def test_what_cannot_be_unpacked_is_named(tmp_path, data):
     with pytest.raises(DataError, match=r"a\.nmea"):
         imported(tmp_path, data)
