@@ -1,8 +1,8 @@
 """Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
 
 COUNT inputs of at most 64 kB for each reader of this package, or for those named (with commas
-between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `nucleus`; their
-process has limits of time and memory.
+between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `tlog` and
+`nucleus`; their process has limits of time and memory.
 """
 
 from __future__ import annotations
@@ -128,11 +128,16 @@ def own_files():
     rowe = (samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))
     return {
         "nmea": [text],
+        "underwater-gps": [
+            data for name, data in samples.underwater_gps(60).items() if name != "orientation"
+        ],
         "pixse": [samples.PIXSE * 40],
         "pd0": [made, *map(head, recordings)],
         "ad2cp": [own, echo],
+        "winriver": [samples.winriver_settings(*((f"a{i}.PD0", i) for i in range(30)))],
         "pd4": [pd4s],
         "pd6": [samples.PD13.encode() * 40],
+        "pd6-table": [samples.stamped_lines(100)],
         "nortek": [nortek],
         "cerulean": [cerulean],
         "water-linked": [
@@ -185,6 +190,10 @@ def of_libraries():
         "ardupilot": [(".bin", lambda: logs.ardupilot_log(logs.ardupilot_trial()))],
         "ulog": [(".ulg", lambda: logs.ulog(logs.ulog_trial()))],
         "nucleus": [(".nucleus", logs.nucleus_trial)],
+        "tlog": [
+            (".tlog", lambda: logs.telemetry_trial()),
+            (".tlog", lambda: logs.telemetry_trial(gps=False)),
+        ],
     }
 
 

@@ -287,6 +287,78 @@ def ardupilot_trial(count=40):
     return out
 
 
+# --- MAVLink telemetry ---------------------------------------------------------------------------
+
+# Number, seed of the checksum, and values in the order in which they are sent.
+MAVLINK = {
+    "SYSTEM_TIME": (2, 137, "QI"),
+    "GPS_RAW_INT": (24, 24, "QiiiHHHHBBiIIIIH"),
+    "RAW_IMU": (27, 144, "Q9hBh"),
+    # Version 1 has no extensions.
+    "RAW_IMU_1": (27, 144, "Q9h"),
+    "ATTITUDE": (30, 39, "I6f"),
+    "GLOBAL_POSITION_INT": (33, 104, "I4i3hH"),
+    "HEARTBEAT": (0, 50, "I5B"),
+    "SCALED_PRESSURE2": (137, 195, "Iff2h"),
+    "GPS_INPUT": (232, 151, "QIii9f2H3B"),
+    "VISION_POSITION_DELTA": (11011, 106, "QQ7f"),
+}
+
+
+def crc_x25(data):
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ 0x8408 * (crc & 1)
+    return crc
+
+
+def telemetry(name, seconds, *values, version=2, sender=(1, 1), signed=False):
+    """Return a message as a ground station logs it: stamp, header, content, checksum."""
+    number, seed, form = MAVLINK[name]
+    content = struct.pack("<" + form, *values)
+    if version == 2:
+        content = content.rstrip(b"\0") or b"\0"
+        head = bytes([len(content), int(signed), 0, 7, *sender]) + number.to_bytes(3, "little")
+    else:
+        head = bytes([len(content), 7, *sender, number])
+    crc = crc_x25(head + content + bytes([seed]))
+    out = round(seconds * 1e6).to_bytes(8, "big") + bytes([0xFD if version == 2 else 0xFE])
+    return out + head + content + crc.to_bytes(2, "little") + bytes(13 if signed else 0)
+
+
+def telemetry_trial(count=40, start=START, boot=100.0, gps=True):
+    """Return a log: each message arrives 20 ms late, some later."""
+    out = []
+    for i in range(count):
+        own, late = boot + 0.1 * i, 0.02 + 0.3 * (i % 3 == 1)
+        at = start + 0.1 * i + late
+        ms, us = round(own * 1e3), round(own * 1e6)
+        out.append(telemetry("HEARTBEAT", at, 0, 12, 3, 81, 4, 3))
+        imu = (us, 100, -50, -1000, 10, 20, 30 + i, 0, 0, 0, 0, 0)
+        out.append(
+            telemetry("RAW_IMU", at, *imu, signed=i % 2 == 0)
+            if i % 4
+            else telemetry("RAW_IMU_1", at, *imu[:10], version=1)
+        )
+        out.append(telemetry("ATTITUDE", at, ms, 0.1, -0.2, -0.5, 0.0, 0.0, 0.0))
+        out.append(telemetry("SCALED_PRESSURE2", at, ms, 1513.25, 0.0, 1200, 0))
+        place = (540000001 + i, -30000002)
+        out.append(telemetry("GLOBAL_POSITION_INT", at, ms, *place, 1500, 0, 20, 10, -30, 9000))
+        if gps:
+            given = (0, 345600000 + 100 * i, *place, -4.5, 1.0, 1.0, 0.1, 0.2, -0.3, 0.4, 1.5, 2.5)
+            # Vertical velocity is to be ignored.
+            out.append(telemetry("GPS_INPUT", at, *given, 16, 2100, 0, 3, 10, sender=(1, 220)))
+        kind = 3 if i else 1
+        received = (us, *place, 4000, 100, 100, 250, 9000, kind, 9, 52000, 500, 900, 120, 0, 0)
+        out.append(telemetry("GPS_RAW_INT", at, *received))
+        delta = (0, 0, 0, 0.1, -0.02, 0.01, 90.0)
+        out.append(telemetry("VISION_POSITION_DELTA", at, us, 100_000, *delta, sender=(1, 191)))
+        out.append(telemetry("SYSTEM_TIME", at, round((start + 0.1 * i) * 1e6), ms))
+    return b"".join(out)
+
+
 # --- PX4 -----------------------------------------------------------------------------------------
 
 

@@ -122,3 +122,67 @@ WATER_LINKED_TABLE = (
         for i in range(40)
     )
 ).encode()
+
+
+def underwater_gps(count=40, start=1_700_000_000.0, heading=90.0):
+    """Return tables of an Underwater GPS by their names, and of the sentences it was given.
+
+    The vessel lies at 54°N 3°W; the vehicle is 10 m ahead of it and 5 m to starboard, 3 m deep.
+    """
+    out = {
+        "acoustic": "timestamp,position_valid,x,y,z,std,valid_r0\n",
+        "position": "timestamp,lat,lon,orientation,fix_quality,hdop,numsats,cog,sog\n",
+        "global": "timestamp,lat,lon,orientation,fix_quality,hdop,numsats,cog,sog\n",
+        "gga": "timestamp,utc,latitude,longitude,fix_quality,numsats,hdop,orthometric_height\n",
+        "hdt": "timestamp,heading\n",
+        "orientation": "timestamp,roll,pitch,yaw,state,progress\n",
+    }
+    for i in range(count):
+        at = start + 0.25 * i
+        clock = f"2213{20 + i // 4:02d}.{i % 4 * 25:02d}"
+        # Asked twice for each place.
+        out["acoustic"] += f"{at},{i % 8 < 6},{10 + 0.001 * (i // 2)},5.0,3.0,1.5,1\n"
+        out["position"] += f"{at},54.0,-3.0,{heading},4,0.8,24,0,0\n"
+        out["global"] += f"{at},54.00001,-3.0,-1,1,0.8,24,-1,-1\n"
+        out["gga"] += f"{at},{clock},54.0,-3.0,4,24,0.8,1.4\n"
+        out["hdt"] += f"{at},{heading}\n"
+        out["orientation"] += f"{at},1.0,358.0,12.0,0,0\n"
+    return {name: text.encode() for name, text in out.items()}
+
+
+def stamped_lines(count=40, start=300.0):
+    """Return lines of PD6 as a logger stamps them: 57 of 60 whole, as on a bad cable."""
+    out = "Timestamp(s),SensorID,RawLine,CmdOrNote\n"
+    out += f'{start},DVL,":CS,",CMD\n{start},DVL,"nonsense, of no type",\n'
+    for i in range(count):
+        at = start + 0.1 * i
+        lines = [
+            f":SA,{1.5:+6.2f},{-2.25:+6.2f},{181.0 + i:6.2f}",
+            ":TS,00010100000194,35.0,+25.0,   0.0,1500.0,003",
+            f":WI,{120:+6d},{-i:+6d},{3:+6d},{0:+6d},A",
+            f":BI,{100 + i:+6d},{-20:+6d},{3:+6d},{1:+6d},{'V' if i == 5 else 'A'}",
+            f":BD,{0.0:+12.2f},{0.0:+12.2f},{0.0:+12.2f},{5.84:+7.2f},{0.09:6.2f}",
+        ]
+        if i % 20 == 7:
+            # A digit is lost: of 107 mm/s, 17 are left.
+            lines[3] = lines[3].replace("0", "", 1)
+        out += "".join(f'{at + 0.002 * k:.6f},DVL,"{line}",\n' for k, line in enumerate(lines))
+    return out.encode()
+
+
+def winriver_settings(*files):
+    """Return a measurement file with a transect for each (name, variation)."""
+    out = '<?xml version="1.0" encoding="utf-8"?>\n<WinRiver><Project Name="a" Version="2.18">'
+    out += "<Site_Information/><Site_Discharge>"
+    for name, variation in files:
+        out += f'<Transect Checked="1"><File PathName="C:\\x" TransectNmb="0">{name}</File>'
+        # What was set in the field, and what is in force.
+        for checked, value in ((0, 99.0), (1, variation)):
+            out += (
+                f'<Configuration Checked="{checked}"><Offsets><Magnetic_Variation Status="2">'
+                f"{value}</Magnetic_Variation><ADCP_Transducer_Depth>0.25</ADCP_Transducer_Depth>"
+                "</Offsets><Ext_Heading><Offset>1.5</Offset></Ext_Heading><GPS><Time_Delay>0"
+                "</Time_Delay></GPS></Configuration>"
+            )
+        out += "</Transect>"
+    return (out + "</Site_Discharge></Project></WinRiver>\n").encode()

@@ -25,9 +25,18 @@ def pd0(parts):
 
 
 def fixed_leader(
-    *, frame=0, cells=2, up=False, convex=True, angle=1, alignment=0, tilts=True, pings=(1, 0.0)
+    *,
+    frame=0,
+    cells=2,
+    up=False,
+    convex=True,
+    angle=1,
+    alignment=0,
+    tilts=True,
+    pings=(1, 0.0),
+    sensors=0,
 ):
-    """Return Table 33: configuration, cells, pings and their interval in s, EX, EA; 59 bytes."""
+    """Return Table 33: configuration, cells, pings and interval in s, EX, EA, EZ; 59 bytes."""
     out = bytearray(59)
     out[0:2] = b"\x00\x00"
     out[4] = 0b0100_0011 | (0x80 if up else 0) | (0x08 if convex else 0)
@@ -38,6 +47,7 @@ def fixed_leader(
     out[12:14] = struct.pack("<H", 50)
     out[25] = frame << 3 | (0b100 if tilts else 0) | 0b10
     out[26:28] = struct.pack("<h", alignment)
+    out[30] = sensors
     out[32:34] = struct.pack("<H", 110)
     return bytes(out)
 

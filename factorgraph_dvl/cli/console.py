@@ -316,7 +316,7 @@ def drawing() -> Iterator[None]:
 
 def stdout() -> Console:
     """Return the console for results."""
-    return _Console(width=None if sys.stdout.isatty() else _PIPE_WIDTH)
+    return _Console(emoji=False, width=None if sys.stdout.isatty() else _PIPE_WIDTH)
 
 
 def stderr() -> Console:
@@ -324,4 +324,4 @@ def stderr() -> Console:
     # Keep the order where both streams go to one file.
     with suppress(OSError):
         sys.stdout.flush()
-    return _Console(stderr=True)
+    return _Console(emoji=False, stderr=True)

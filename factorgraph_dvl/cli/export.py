@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import print_file, warn
-from factorgraph_dvl.cli.options import Force
+from factorgraph_dvl.cli.options import Force, Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,9 +31,16 @@ class ExportFormat(StrEnum):
     CSV = "csv"
     MCAP = "mcap"
     PD0 = "pd0"
+    URDF = "urdf"
+    TF = "tf"
+    ARDUPILOT = "ardupilot"
+    WATER_LINKED = "water-linked"
+    NUCLEUS = "nucleus"
 
 
-_TRAJECTORIES = tuple(x for x in ExportFormat if x.value not in ("csv", "mcap", "pd0"))
+_TRIALS = ("csv", "mcap", "pd0")
+_SETTINGS = tuple(x.value for x in Target)
+_TRAJECTORIES = tuple(x for x in ExportFormat if x.value not in (*_TRIALS, *_SETTINGS))
 
 
 def export(
@@ -48,20 +55,23 @@ def export(
         typer.Option(
             "--out",
             metavar="FILE",
-            help="File to write; by default DIR/trajectory.FORMAT or DIR/trial.FORMAT.",
+            help="File to write; by default in DIR.",
         ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Export the trajectory of a solution, or the records of a trial.
+    """Export the trajectory or the calibration of a solution, or the records of a trial.
 
     Trajectories have UTC and σ where the format has room for them: tum, kml, geojson, netcdf,
     parquet, sbet, nmea, matlab. Trials: csv and parquet (folders), netcdf, mcap, pd0.
+    Settings of vehicles and instruments: urdf, tf, ardupilot, water-linked, nucleus.
 
     Examples:
       factorgraph-dvl export out --to tum
 
       factorgraph-dvl export out --to kml --out track.kml
+
+      factorgraph-dvl export out --to urdf
 
       factorgraph-dvl export trial --to pd0
     """
@@ -74,7 +84,26 @@ def export(
             warn(note)
         print_file(written)
         return
+    if to.value in _SETTINGS:
+        _export_settings(folder, to.value, out, force=force)
+        return
     _export_solution(folder, to, out, force=force)
+
+
+def _export_settings(folder: Path, to: str, out: Path | None, *, force: bool) -> None:
+    from factorgraph_dvl.analysis.vehicle_settings import TARGETS, settings_text
+    from factorgraph_dvl.files.calibration_file import check_usable, load_calibration
+    from factorgraph_dvl.files.folders import check_new_file, write_file
+
+    found = load_calibration(folder)
+    check_usable(found, found.body_axes, str(folder))
+    file = out or folder / f"dvl-{to}.{TARGETS[to][1]}"
+    # What lies in the folder under these names was exported before.
+    force = force or out is None
+    check_new_file(file, force=force)
+    text = settings_text(found, to)
+    write_file(file, lambda path: path.write_text(text, encoding="utf-8"), force=force)
+    print_file(file)
 
 
 def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force: bool) -> None:
@@ -88,7 +117,7 @@ def _export_solution(folder: Path, to: ExportFormat, out: Path | None, *, force:
         raise ConfigError(
             f"`{to}` is not a format of trajectories",
             where="--to",
-            expected=", ".join(_TRAJECTORIES),
+            expected=", ".join((*_TRAJECTORIES, *_SETTINGS)),
             hint=f"{folder} is not a trial folder; only trials have csv, mcap and pd0",
         )
     file = out or folder / f"{EXPORT_STEM}.{to.value}"

@@ -20,6 +20,16 @@ Force = Annotated[bool, typer.Option("--force", help="Replace existing results."
 NoFigures = Annotated[bool, typer.Option("--no-figures", help="Do not draw figures.")]
 
 
+class Target(StrEnum):
+    """Vehicles and instruments that a calibration can be written for."""
+
+    URDF = "urdf"
+    TF = "tf"
+    ARDUPILOT = "ardupilot"
+    WATER_LINKED = "water-linked"
+    NUCLEUS = "nucleus"
+
+
 class FigureKind(StrEnum):
     """Formats of figures."""
 

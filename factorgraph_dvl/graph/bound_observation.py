@@ -23,9 +23,6 @@ from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
 
-# How far, s, two times count as one. Measured: 2 Hz sway of 4 deg then differs by 3e-6 rad/s from
-# a straight line in the rate.
-SAME_TIME = 2e-4
 # Unit of the residuals of attitudes.
 _ANGLE = "rad"
 

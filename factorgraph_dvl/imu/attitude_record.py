@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +15,15 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
-from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, white_gain
+from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, slope_gain, white_gain
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.ins import Ins
-from factorgraph_dvl.sensors.records import at_row, noise_beside_motion, white_noise
+from factorgraph_dvl.sensors.records import at_row, white_noise
 
 # Standard deviation of a spline's slope at its knots for white noise of 1 in knots 1 s apart.
 _SLOPE = 1.22
 # Span, s, of a local cubic. Chosen: waves that move a ship are longer.
 _SMOOTHED = 1.5
-# Places from a sample to the middle of an interval at which the noise of a rate is evaluated.
-_PLACES = np.linspace(0.0, 0.5, 5)
 # Sample intervals, and s, that make a gap, in which attitude is not known. Chosen: a cubic through
 # longer ones is a guess.
 _GAP_INTERVALS = 3.5
@@ -104,34 +101,21 @@ class AttitudeRecord:
                 where=at_row(sensor.source, np.flatnonzero(known)[steep[0]]),
                 expected="pitch within 80 deg",
             )
-        interval = float(np.median(np.diff(self.time)))
+        self.interval = float(np.median(np.diff(self.time)))
         noise = white_noise(rph)
-        width = _width(interval)
-        smooth = _smoothed(self.time, rph, width, 1.5 * interval)
+        width = _width(self.interval)
+        smooth = _smoothed(self.time, rph, width, 1.5 * self.interval)
         self._spline = CubicSpline(self.time, smooth)
         self._rate, self._change = self._spline.derivative(), self._spline.derivative(2)
-        self.interval = float(np.median(np.diff(self.time)))
         stated = sensor.error.white
         self.white = noise if estimated else stated
         # What the smoothing leaves of white noise, in angle and rate.
-        gain, slope = (
-            white_gain(width, deriv=d) / self.interval**d if width else alone
-            for d, alone in ((0, 1.0), (1, _SLOPE / self.interval))
-        )
-        self._rate_sigma = slope * self.white
-        # Of samples that are far apart, noise looks like motion that they miss.
-        self._noise = np.minimum(noise_beside_motion(rph), self.white) if width else np.zeros(3)
-        self._gains = _rate_gains(width)
+        gain, slope = (white_gain(width), slope_gain(width)) if width else (1.0, _SLOPE)
+        self._rate_sigma = slope * self.white / self.interval
         self.white = gain * self.white
         if isinstance(sensor, Attitude) and not sensor.measures_tilt:
             self.white = np.where([True, True, False], stated, self.white)
         self._gap = longest_gap(self.time)
-
-    def of_rows(self, sensor: Attitude | Ins) -> AttitudeRecord:
-        """Return the record of other rows of the sensor, with the same white noise."""
-        out = AttitudeRecord(sensor, self.body_axes, estimated=False)
-        out.white, out._rate_sigma, out._noise = self.white, self._rate_sigma, self._noise
-        return out
 
     def covers(self, time: Array) -> np.ndarray:
         """Whether attitude is known at stamps (M,) of the sensor."""
@@ -143,24 +127,6 @@ class AttitudeRecord:
     def rph_at(self, time: Array) -> Array:
         """Return roll, pitch, heading (M, 3), rad, as measured, constant beyond the ends."""
         return np.asarray(self._spline(np.clip(time, self.time[0], self.time[-1])))
-
-    def rate_noise(self, time: Array, by_rph: Array) -> Array:
-        """Return variances (M, 3) of turn rates by noise that no motion explains, (rad/s)².
-
-        It is zero for records that are not smoothed, because they miss motion.
-
-        Parameters
-        ----------
-        time : ndarray, shape (M,), s
-            Stamps of the sensor.
-        by_rph : ndarray, shape (M, 3, 3)
-            Derivative of rotations about the axes of the body by roll, pitch, heading.
-        """
-        after = np.clip(np.searchsorted(self.time, time), 1, self.time.size - 1)
-        interval = self.time[after] - self.time[after - 1]
-        place = np.clip((time - self.time[after - 1]) / interval, 0.0, 1.0)
-        gain = np.interp(np.minimum(place, 1.0 - place), _PLACES, self._gains) / interval
-        return np.asarray(by_rph**2 @ self._noise**2 * gain[:, None] ** 2)
 
     def at(self, time: Array, error: Array, nRl: Array) -> BodyAttitude:
         """Return attitude and rates at stamps (M,).
@@ -234,20 +200,3 @@ def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
         if b - a >= width:
             out[a:b] = local_cubics(rph[a:b], width)
     return out
-
-
-@lru_cache
-def _rate_gains(width: int) -> Array:
-    """Return standard deviations of rates at `_PLACES` for white noise of 1 in samples 1 s apart.
-
-    Parameters
-    ----------
-    width : int
-        Samples over which the record is smoothed; 0 = it is not.
-    """
-    if not width:
-        return np.zeros(_PLACES.size)
-    half = 6 * width
-    one = np.eye(1, 2 * half + 1, half).T
-    spline = CubicSpline(np.arange(len(one)), local_cubics(one, width))
-    return np.array([np.linalg.norm(spline(np.arange(2 * half) + p, 1)) for p in _PLACES])

@@ -170,7 +170,7 @@ def smooth(
         spline=spline,
         misfit=line,
         sigma=sigma * white_gain(width),
-        slope_sigma=sigma * _slope_gain(width) / dt,
+        slope_sigma=sigma * slope_gain(width) / dt,
         window=width,
     )
 
@@ -230,7 +230,7 @@ def white_gain(width: int, deriv: int = 0) -> float:
 
 
 @lru_cache(maxsize=64)
-def _slope_gain(width: int) -> float:
+def slope_gain(width: int) -> float:
     """Return that of the derivative of the spline, at unit intervals, between the samples.
 
     Smoothed values are correlated, and a window ends with a step: a wide one leaves twice the

@@ -373,12 +373,6 @@ class Imu:
         settings = msgspec.structs.replace(self.settings, calibration=UNSET)
         return replace(self, settings=settings, prior=None)
 
-    def without_errors(self) -> Self:
-        """Return the record with an IMU of exact scale and axes, and no g-sensitivity."""
-        keys = (f"{spec.stem}_std_{spec.unit}" for spec, _ in _ERRORS)
-        exact = msgspec.structs.replace(self.settings, **dict.fromkeys(keys, 0.0))
-        return replace(self, settings=exact)
-
     def error_parameters(self) -> tuple[Parameter, ...]:
         """Return scale, axes and g-sensitivity with their priors."""
         return tuple(

@@ -13,10 +13,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.ranges import range_of
 
 # Weights of the samples two before, one before, one after and two after, through which a cubic
-# passes; and covariances of a sample less these with the same up to three samples later, for white
-# noise of 1.
+# passes.
 _NEIGHBOURS = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
-_BY_LAG = np.array([70.0, -56.0, 28.0, -8.0]) / 36.0
 
 _AnyRecord = TypeVar("_AnyRecord")
 
@@ -169,29 +167,8 @@ def white_noise(values: Array) -> Array:
 
     It is what a cubic through the neighbours misses, by the median absolute deviation.
     """
-    missed = _missed(values)
-    return np.asarray(1.4826 * np.median(np.abs(missed), axis=0) / np.sqrt(_BY_LAG[0]))
-
-
-def noise_beside_motion(values: Array) -> Array:
-    """Return the white noise of samples (M, n) that no motion explains, M of five or more, (n,).
-
-    What a cubic through the neighbours misses has covariances of known ratios from one sample to
-    the next, if it is white noise: 1, -0.8, 0.4, -0.11. Motion has others, and what fits all of
-    them is noise. Only motion at half the sampling rate looks like noise.
-    """
-    missed = _missed(values)
-    count = len(missed)
-    by_lag = [
-        np.mean(missed[lag:] * missed[: count - lag], axis=0) / white
-        for lag, white in enumerate(_BY_LAG)
-        if lag < count
-    ]
-    return np.asarray(np.sqrt(np.maximum(np.min(by_lag, axis=0), 0.0)))
-
-
-def _missed(values: Array) -> Array:
-    """Return samples (M, n) less cubics through their neighbours, (M - 4, n)."""
     before = _NEIGHBOURS[0] * values[:-4] + _NEIGHBOURS[1] * values[1:-3]
     after = _NEIGHBOURS[2] * values[3:-1] + _NEIGHBOURS[3] * values[4:]
-    return np.asarray(values[2:-2] - before - after)
+    missed = values[2:-2] - before - after
+    gain = np.sqrt(1.0 + _NEIGHBOURS @ _NEIGHBOURS)
+    return np.asarray(1.4826 * np.median(np.abs(missed), axis=0) / gain)

@@ -22,6 +22,10 @@ from factorgraph_dvl.trial import Trial
 _MISALIGNMENT = "misalignment_deg"
 # Component of an attitude that is the heading.
 _HEADING = 2
+# Chosen: angle of a mount, deg, up to which its components are angles about axes, to a percent.
+_LARGE_DEG = 15.0
+# Horizontal part of an axis that has a bearing. Chosen: at least one axis has more.
+_LEVEL = 0.5
 
 
 def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Finding]:
@@ -39,19 +43,54 @@ def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Fin
         return
     values = found.minimum.evaluation.parameters
     mean, by_error = _mean_error(problem, lasting, values, sensor)
-    down = frd_from_body(trial.body_axes)[2]
+    frd = frd_from_body(trial.body_axes)
+    down = frd[2]
     alone = {problem.key(_MISALIGNMENT): down[None]}
     P = found.covariances.information.covariance_of([alone, alone | by_error])
-    std, relative_std = np.sqrt(np.diag(P)) / DEG
-    angle = -float(down @ in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value)
-    text = message(
-        "heading_error.about_the_vertical",
-        angle=angle,
-        std=float(std),
-        relative=angle - mean / DEG,
-        relative_std=float(relative_std),
-    )
+    std, relative_std = (float(x) for x in np.sqrt(np.diag(P)) / DEG)
+    turn = in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value
+    if np.linalg.norm(turn) > _LARGE_DEG:
+        # A component of a large rotation vector is no angle about its axis.
+        axis, angle = foremost(values[_MISALIGNMENT] @ frd.T)
+        text = message(
+            "heading_error.bearing",
+            axis=axis,
+            angle=angle,
+            std=std,
+            relative=angle - mean / DEG,
+            relative_std=relative_std,
+        )
+    else:
+        angle = -float(down @ turn)
+        text = message(
+            "heading_error.about_the_vertical",
+            angle=angle,
+            std=std,
+            relative=angle - mean / DEG,
+            relative_std=relative_std,
+        )
     yield Finding(Code.HEADING_ERROR, text, parameter=_MISALIGNMENT)
+
+
+def foremost(axes: Array) -> tuple[str, float]:
+    """Return which horizontal axis of a DVL points ahead most, and its bearing.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (3, 3)
+        Axes x, y, z, a row each, in forward, starboard, down of the vehicle.
+
+    Returns
+    -------
+    name : str
+        Of the axis.
+    bearing : float, deg
+        From the bow, positive to starboard.
+    """
+    is_level = np.hypot(axes[:, 0], axes[:, 1]) > _LEVEL
+    index = int(np.argmax(np.where(is_level, axes[:, 0], -np.inf)))
+    forward, starboard, _ = axes[index]
+    return "xyz"[index], float(np.degrees(np.arctan2(starboard, forward)))
 
 
 def _lasting(problem: Problem) -> Process | None:

@@ -186,15 +186,6 @@ def _is_plausible(p: Parameter, test: Score) -> bool:
     return bool(np.all(np.abs(test.step) < _FAR * wide(p, p.mean).sigma))
 
 
-def confirmed(problem: Problem, minimum: Minimum, found: Explanation) -> bool:
-    """Whether a parameter is another than it was taken to be, now that it is estimated."""
-    name = found.parameter.name
-    P = minimum.information.covariance_of([{problem.key(name): np.eye(found.parameter.mean.size)}])
-    moved = minimum.evaluation.parameters[name] - found.parameter.mean
-    again = Score(float(moved @ np.linalg.solve(P, moved)), moved.size, moved, np.sqrt(np.diag(P)))
-    return again.log10_p < _LOG10_P
-
-
 def _chi_square(explanation: Explanation) -> Message:
     """Return how strong the evidence is, in brackets."""
     score = explanation.score

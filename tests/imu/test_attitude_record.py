@@ -29,20 +29,11 @@ def record_of(interval, *, noise=1.0, estimated=True):
 
 
 @pytest.mark.parametrize("interval", [0.2, 0.1, 0.05])
-@pytest.mark.parametrize("place", [0.0, 0.25, 0.5])
-def test_rates_have_the_noise_that_is_said(interval, place):
+def test_rates_have_the_noise_that_is_said(interval):
     record = record_of(interval)
-    time = (np.arange(40, 19960) + place) * interval
+    time = (np.arange(40, 19960) + 0.25) * interval
     body = record.at(time, np.zeros((time.size, 3)), np.broadcast_to(np.eye(3), (time.size, 3, 3)))
     truth = (body.theta_by_rph @ rolling(time)[1][:, :, None])[:, :, 0]
     measured = np.mean((body.omega_eb_b - truth) ** 2, axis=0)
-    said = np.mean(record.rate_noise(time, body.theta_by_rph), axis=0)
+    said = np.mean(body.omega_sigma**2, axis=0)
     np.testing.assert_allclose(said, measured, rtol=0.1)
-
-
-def test_no_noise_of_rates_is_known_where_samples_miss_motion():
-    time = np.arange(100.0, 200.0)
-    by_rph = np.broadcast_to(np.eye(3), (time.size, 3, 3))
-    assert not record_of(1.0).rate_noise(time, by_rph).any()
-    # What the trial states is the most that it may be: here nothing.
-    assert not record_of(0.2, estimated=False).rate_noise(time, by_rph).any()

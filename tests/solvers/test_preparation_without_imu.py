@@ -11,9 +11,11 @@ import msgspec
 import numpy as np
 import pytest
 from monte_carlo import rms_band
+from scipy.spatial.transform import Rotation
 from truth import CONFIGS, SCHULER, config, with_ins
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.errors import ConfigError, FactorgraphDvlError
 from factorgraph_dvl.files.trial_folder import load_trial, save_trial
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
@@ -21,6 +23,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import load_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solve_with_problem
+from factorgraph_dvl.solvers.heading_and_misalignment import foremost
 from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 
@@ -149,6 +152,37 @@ def test_the_phase_is_known_better_relative_to_the_compass(solution):
     alone, together = (float(part.split()[0]) for part in str(note).split("±")[1:])
     assert together < alone
     assert alone == pytest.approx(solution.estimate("misalignment_deg").std[2], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("axes", "expected"),
+    [
+        # Turned by 100 deg to starboard: no axis points ahead, and z points down.
+        (Rotation.from_euler("z", 100.0, degrees=True).as_matrix().T, ("x", 100.0)),
+        (Rotation.from_euler("z", -80.0, degrees=True).as_matrix().T, ("y", 10.0)),
+        # Turned over, with the y axis ahead.
+        (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), ("y", 0.0)),
+    ],
+)
+def test_the_axis_that_points_ahead(axes, expected):
+    name, angle = foremost(axes)
+    assert (name, pytest.approx(angle)) == expected
+
+
+def test_a_mount_that_is_turned_far_is_said_by_a_bearing():
+    scenario = shortened()
+    dvl = msgspec.structs.replace(scenario.dvl, misalignment_deg=[0.0, 0.0, -60.0])
+    solution = solve(simulate(shortened(dvl=dvl), 1), rate_hz=1.0)
+    (note,) = (f for f in solution.findings if f.code == Code.HEADING_ERROR)
+    values = dict(note.message.values)
+    axis, angle, std = values["axis"], values["angle"], values["std"]
+    terms = instrument_of(solution)
+    assert axis == "x"
+    ahead = terms.axes[0]
+    assert angle == pytest.approx(np.degrees(np.arctan2(ahead[1], ahead[0])))
+    # The DVL is turned to starboard, as its readings are to port.
+    assert abs(angle - 60.0) < 4.0 * std
+    assert std == pytest.approx(solution.estimate("misalignment_deg").std[2], rel=0.1)
 
 
 def test_a_trial_without_imu_survives_its_folder(ship, tmp_path):

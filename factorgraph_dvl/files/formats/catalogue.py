@@ -9,25 +9,31 @@ from factorgraph_dvl.files.formats import (
     pd0,
     pd4,
     pd6,
+    pd6_table,
     pixse,
     rowe,
     rtklib,
     sbet,
+    underwater_gps,
     water_linked,
     water_linked_table,
+    winriver,
 )
 from factorgraph_dvl.files.formats.format import Format
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
-from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, ulog
+from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, telemetry, ulog
 
 FORMATS: tuple[Format, ...] = (
     *pd0.FORMATS,
+    winriver.FORMAT,
     *ad2cp.FORMATS,
     *pd4.FORMATS,
     *pd6.FORMATS,
+    pd6_table.FORMAT,
     *dvl_sentences.FORMATS,
     *water_linked.FORMATS,
     *water_linked_table.FORMATS,
+    underwater_gps.FORMAT,
     *rowe.FORMATS,
     *rtklib.FORMATS,
     *sbet.FORMATS,
@@ -36,6 +42,7 @@ FORMATS: tuple[Format, ...] = (
     nucleus.FORMAT,
     bags.FORMAT,
     ardupilot.FORMAT,
+    telemetry.FORMAT,
     ulog.FORMAT,
     TABLE,
 )

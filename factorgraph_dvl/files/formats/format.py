@@ -35,13 +35,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.files.formats.framing import Records
-from factorgraph_dvl.files.formats.losses import NO_LOCK, NO_TIME, NO_VALUE, Losses
+from factorgraph_dvl.files.formats.losses import NO_FIX, NO_LOCK, NO_TIME, NO_VALUE, Losses
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 
 Family = Literal["dvl", "ins", "gnss", "vehicle", "table"]
 Kind = Literal[
-    "dvl", "water", "fix", "course", "attitude", "ins", "ins_std", "imu", "depth", "clock"
+    "dvl",
+    "water",
+    "fix",
+    "course",
+    "attitude",
+    "ins",
+    "ins_std",
+    "imu",
+    "depth",
+    "clock",
+    "acoustic",
+    "topside",
+    "settings",
 ]
 # `utc`: seconds since 1970. `own`: the recording clock of the file, seconds since 1970 (perhaps of
 # local time) or since its start. `day`: seconds of the UTC day. `week`: of the GPS week.
@@ -90,6 +102,11 @@ _PING = np.dtype(
 # ins_std   standard deviations of a navigation solution that has a file of its own.
 # imu       `gyro` rad/s and `accel` m/s² (specific force), in `Batch.axes`.
 # depth     `depth` m below the surface.
+# acoustic  `place` of the vehicle, forward, starboard, down of a vessel at the surface; `std`; m.
+# topside   `lat`, `lon` of that vessel and `quality` as in GGA; its true `heading`.
+# settings  what was set for the file that `Batch.stream` names, without a time: magnetic
+#           `declination`; `transducer_depth` m; `heading_offset` of an external compass; `delay`
+#           of GNSS, s.
 # clock     `time` is UTC at `received`; `number` of the ping that it belongs to, or -1.
 KINDS: dict[Kind, np.dtype[Any]] = {
     "dvl": _PING,
@@ -118,6 +135,17 @@ KINDS: dict[Kind, np.dtype[Any]] = {
     "imu": np.dtype([*_HEAD, ("gyro", "f8", (3,)), ("accel", "f8", (3,))]),
     "depth": np.dtype([*_HEAD, ("depth", "f8")]),
     "clock": np.dtype([*_HEAD, ("number", "i8")]),
+    "acoustic": np.dtype([*_HEAD, ("place", "f8", (3,)), ("std", "f8")]),
+    "topside": np.dtype(
+        [*_HEAD, *((name, "f8") for name in ("lat", "lon", "quality", "heading"))]
+    ),
+    "settings": np.dtype(
+        [
+            *_HEAD,
+            *((name, "f8") for name in ("declination", "transducer_depth")),
+            *((name, "f8") for name in ("heading_offset", "delay")),
+        ]
+    ),
 }
 
 
@@ -197,6 +225,7 @@ class Format:
         sample is empty.
     read : callable
         Given the path and a mapping (plain content of the YAML, None without), yields batches.
+        Raises ConfigError if `module` is not installed, and DataError if nothing can be read.
     verified : str
         What the reader was compared with; `not verified` where nothing could be had.
     endings : tuple of str, optional
@@ -234,16 +263,23 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
     """Return which records (N,) of a batch cannot be used, by the reason, each for one reason."""
     records = batch.records
     timeless = np.isnan(records["time"]) & np.isnan(records["received"])
+    if batch.kind == "settings":
+        timeless[:] = False
     valueless, reason = np.zeros(len(records), bool), NO_VALUE
     if batch.kind in ("dvl", "water"):
         along = np.isfinite(records["beams"]).any(axis=1) & (records["axes"] == 0)
         valueless, reason = ~np.isfinite(records["velocity"]).all(axis=1) & ~along, NO_LOCK
     elif batch.kind == "imu":
         valueless = ~(np.isfinite(records["gyro"]) & np.isfinite(records["accel"])).all(axis=1)
+    elif batch.kind == "acoustic":
+        valueless = ~np.isfinite(records["place"]).all(axis=1)
+    elif batch.kind == "topside":
+        valueless = np.isnan(records["lat"]) & np.isnan(records["heading"])
     elif batch.kind == "attitude":
         valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
     elif (name := _VALUE.get(batch.kind)) is not None:
         valueless = np.isnan(records[name])
+        reason = NO_FIX if batch.kind == "fix" else NO_VALUE
     return {NO_TIME: timeless, reason: valueless & ~timeless}
 
 

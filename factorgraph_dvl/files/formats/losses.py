@@ -13,6 +13,7 @@ _WRONG = "{} with a wrong checksum"
 _BYTES = "byte outside records"
 # Why a whole record is skipped. A type that no reader here knows is no fault of the file.
 UNKNOWN_TYPE = "type not read"
+REPEATED = "repeats another one"
 NO_FIX = "no fix"
 NO_LOCK = "no lock"
 NO_VALUE = "no value"

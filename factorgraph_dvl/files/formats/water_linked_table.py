@@ -18,13 +18,9 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out
-from factorgraph_dvl.files.formats.framing import (
-    BLOCK_OF_LINES,
-    Source,
-    lines,
-    map_file,
-    number,
-)
+from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, map_file, number
+from factorgraph_dvl.files.formats.headed_table import find_header
+from factorgraph_dvl.files.formats.headed_table import rows as table_rows
 from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.velocities import INSTRUMENT, pings, records
 from factorgraph_dvl.files.formats.water_linked import Row, velocity_of
@@ -33,9 +29,8 @@ from factorgraph_dvl.geometry.vectors import Array
 _NEEDED = frozenset(("time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid"))
 _BEAM = re.compile(r"transducers?[^0-9A-Za-z]*(\d)[^0-9A-Za-z]+(velocity|distance|beam_valid)")
 _TRUE = (b"true", b"1", b"1.0", b"y", b"yes", b"t")
-_OTHER_CELLS = "row with another number of cells"
-# Rows by which `time` is judged, and lines among which the names of columns stand.
-_JUDGED, _FIRST_LINES = 200, 5
+# Rows by which `time` is judged.
+_JUDGED = 200
 # Stamps from 1973 on in each unit, the largest first; smaller ones are seconds.
 _UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
 _STAMPS = "`time` increases from row to row → stamps in {unit:g} s"
@@ -44,23 +39,22 @@ _STEPS = "`time` does not increase → milliseconds since the row before, as in 
 
 def share(path: Path, sample: bytes) -> float:
     """Return whether the first lines of a sample name the columns of such a table."""
-    return float(_header(sample) is not None)
+    return float(find_header(sample, _NEEDED) is not None)
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
     source = map_file(path)
-    found = _header(source)
-    if found is None:
+    header = find_header(source, _NEEDED)
+    if header is None:
         return
-    separator, names, start = found
-    losses = Losses()
-    texts = (line for _, line in islice(_rows(source, separator, names, start), _JUDGED))
+    names, losses = header.names, Losses()
+    texts = (line for _, line in islice(table_rows(source, header), _JUDGED))
     unit = _unit_of_stamps(np.array([_seconds(cells[names.index("time")]) for cells in texts]))
     note = _STEPS if unit is None else _STAMPS.format(unit=unit)
     rows: list[Row] = []
     elapsed = 0.0
-    for at, cells in _rows(source, separator, names, start, losses):
+    for at, cells in table_rows(source, header, losses):
         row = velocity_of(_message(names, cells))
         step = row.pop("step")
         if unit is not None:
@@ -79,30 +73,6 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
 def _batch(rows: list[Row], note: str) -> Batch:
     found = pings(records(rows, INSTRUMENT), "own", "FRD", "")
     return Batch("dvl", found.records, "own", axes="FRD", notes=(note,))
-
-
-def _header(source: Source) -> tuple[bytes, list[str], int] | None:
-    """Return separator, names of columns and where the rows start; None if there are none."""
-    for at, line in islice(lines(source), _FIRST_LINES):
-        for separator in (b",", b";", b"\t"):
-            cells = line.removeprefix(b"\xef\xbb\xbf").split(separator)
-            names = [cell.strip(b' "').decode("latin-1") for cell in cells]
-            if set(names) >= _NEEDED:
-                return separator, names, at + len(line) + 1
-    return None
-
-
-def _rows(
-    source: Source, separator: bytes, names: list[str], start: int, losses: Losses | None = None
-) -> Iterator[tuple[int, list[bytes]]]:
-    for at, line in lines(source):
-        if at < start or not line.strip():
-            continue
-        cells = [cell.strip(b' "') for cell in line.split(separator)]
-        if len(cells) == len(names):
-            yield at, cells
-        elif losses is not None:
-            losses.add(_OTHER_CELLS, at)
 
 
 def _unit_of_stamps(time: Array) -> float | None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
+from factorgraph_dvl.files.formats.losses import REPEATED, UNKNOWN_TYPE, Losses
 
 # Share of a type above which what is left out is worth a warning.
 _MUCH = 0.1
+# What is skipped for these reasons is not lost.
+_NO_LOSS = (UNKNOWN_TYPE, REPEATED)
 _DAMAGED = "damaged"
 _BYTE = "byte "
 
@@ -86,7 +88,7 @@ class Account:
         total = sum(read + skipped for _, read, skipped, _ in self.rows())
         out = []
         for kind, tally in self.types.items():
-            lost = sum(n for reason, n in tally.skipped.items() if reason != UNKNOWN_TYPE)
+            lost = sum(n for reason, n in tally.skipped.items() if reason not in _NO_LOSS)
             whole = total if kind == _DAMAGED else tally.read + sum(tally.skipped.values())
             if lost > _MUCH * whole:
                 out.append(

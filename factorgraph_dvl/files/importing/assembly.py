@@ -83,7 +83,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     out.settings |= {"format": 1, "name": name}
     if epoch >= FIRST_DATE:
         out.settings["epoch"] = f"{np.datetime64(int(epoch), 's')}Z"
-    imu = motion.choose(streams, "imu", decisions)
+    imu = motion.choose_imu(streams, decisions)
     ins = None if imu is not None else motion.choose(streams, "ins", decisions)
     gnss = positions.choose(streams, decisions)
     if imu is not None and gnss is None:

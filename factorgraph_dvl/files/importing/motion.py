@@ -9,19 +9,42 @@ import numpy as np
 
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing.decisions import Decisions
-from factorgraph_dvl.files.importing.merging import Beside, Merged, merge
+from factorgraph_dvl.files.importing.merging import SAMPLE, Beside, Merged, merge
 from factorgraph_dvl.files.importing.positions import best_source
 from factorgraph_dvl.files.importing.time_base import Timed
 from factorgraph_dvl.files.motion_table import COLUMNS, STD_COLUMNS
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
+# Chosen: time between samples of an IMU, s, in which a vehicle turns and turns back unseen.
+_SLOWEST_IMU = 0.1
 _STDS = ("std", "velocity_std", "attitude_std")
 
 
 def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged | None:
     """Return the records of a kind from its fullest source in all files, None without."""
     return merge(best_source(streams, kind, _count, decisions), decisions)
+
+
+def choose_imu(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
+    """Return the samples of the fullest IMU, None without one or if it is too slow to integrate.
+
+    An IMU that is too slow is kept if nothing else says how the vehicle turned.
+    """
+    imu = choose(streams, "imu", decisions)
+    if imu is None or imu.count < 2:
+        return imu
+    time = imu.streams[0].time[:SAMPLE]
+    step = float(np.nanmedian(np.diff(time)))
+    others = [t.stream.label for t in streams if t.stream.kind in ("attitude", "ins") and t.known]
+    if step <= _SLOWEST_IMU or not others:
+        return imu
+    decisions.add(
+        imu.label,
+        f"samples {step:.2g} s apart do not show how the vehicle moved in between → the IMU is "
+        f"not used, but {others[0]}",
+    )
+    return None
 
 
 def _count(source: Sequence[Timed]) -> float:

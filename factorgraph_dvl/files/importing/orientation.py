@@ -101,9 +101,10 @@ def choose(
     std, offset = _TRUE if stream.heading == "true" else _UNKNOWN
     if stream.heading == "magnetic":
         std, offset = _MAGNETIC_STD, _MAGNETIC_OFFSET
-        found = _declination(
-            where, float(np.median(attitude.sample_time)), attitude.label, decisions
-        )
+        found = _declination_set(streams, attitude, decisions)
+        if found is None:
+            time = float(np.median(attitude.sample_time))
+            found = _declination(where, time, attitude.label, decisions)
         if found is not None:
             declination, offset = found, _CORRECTED_OFFSET
     elif stream.heading == "unknown":
@@ -122,6 +123,30 @@ def choose(
     deviation = _DEVIATION if stream.heading == "magnetic" else 0.0
     own = stream.stream == OWN
     return ImportedAttitude(attitude, tilt, declination, std, offset, deviation, own)
+
+
+def _declination_set(
+    streams: Sequence[Timed], attitude: Merged, decisions: Decisions
+) -> float | None:
+    """Return the declination that was set for the files of an attitude, rad, None without."""
+    settings = [t.stream for t in streams if t.stream.kind == "settings"]
+    files = {t.stream.file.casefold() for t in attitude.streams}
+    named = [s for s in settings if s.stream.casefold() in files] or settings
+    values = {float(s.records[:1]["declination"][0]) for s in named}
+    if len(values) > 1:
+        decisions.add(
+            attitude.label, "several magnetic variations were set, none for it → none is used"
+        )
+    if len(values) != 1:
+        return None
+    (value,) = values
+    decisions.add(
+        attitude.label,
+        f"magnetic headings; the variation that was set, {value / DEG:+.2f}° → added; the rest, a "
+        "deviation of the compass, is estimated as an offset",
+        "attitude.heading_offset_std_deg",
+    )
+    return value
 
 
 def _has_heading(timed: Timed) -> bool:

@@ -22,8 +22,10 @@ from factorgraph_dvl.sensors.gnss import (
 
 # Chosen, typical of receivers: horizontal standard deviation by the quality in GGA, m (single,
 # differential, PPS, fixed and float ambiguities, SBAS), and the vertical one relative to it.
-_STD_BY_QUALITY = {1: 3.0, 2: 1.0, 3: 1.0, 4: 0.02, 5: 0.3, 9: 1.0}
-_UNKNOWN_STD, _VERTICAL = 3.0, 2.0
+STD_BY_QUALITY = {1: 3.0, 2: 1.0, 3: 1.0, 4: 0.02, 5: 0.3, 9: 1.0}
+UNKNOWN_STD, _VERTICAL = 3.0, 2.0
+# Quality of what is computed without a receiver, as by a filter.
+_ESTIMATED = 6.0
 # Chosen: heave of a vessel whose fixes have no height, m.
 _HEAVE_STD = 2.0
 # Speed, m/s, below which a course is noise. Chosen: three times that of a Doppler velocity.
@@ -92,8 +94,8 @@ class Positions:
 
     def _std(self, fixes: Records) -> Array:
         """Return standard deviations of positions (M, 3): stated, or by quality."""
-        level = np.full(len(fixes), _UNKNOWN_STD)
-        for quality, std in _STD_BY_QUALITY.items():
+        level = np.full(len(fixes), UNKNOWN_STD)
+        for quality, std in STD_BY_QUALITY.items():
             level[fixes["quality"] == quality] = std
         up = level * _VERTICAL if self.height else np.full(len(fixes), _HEAVE_STD)
         typical = np.stack([level, level, up], axis=1)
@@ -153,9 +155,10 @@ def _count(source: Sequence[Timed]) -> tuple[float, ...]:
 
 def _rank_of_fixes(source: Sequence[Timed]) -> tuple[float, ...]:
     parts = [timed.stream.records[:SAMPLE] for timed in source]
+    is_measured = any((part["quality"] != _ESTIMATED).any() for part in parts)
     has_std = any(np.isfinite(part["std"]).any() for part in parts)
     has_height = any(np.isfinite(part[n]).any() for part in parts for n in ("height", "altitude"))
-    return (float(has_std), float(has_height), *_count(source))
+    return (float(is_measured), float(has_std), float(has_height), *_count(source))
 
 
 def _height(fixes: Merged, decisions: Decisions) -> str:

@@ -18,6 +18,7 @@ from factorgraph_dvl.files.formats.mapping import MappingSettings
 from factorgraph_dvl.files.formats.sentences import text_losses
 from factorgraph_dvl.files.formats.table import FORMAT as TABLE
 from factorgraph_dvl.files.importing.account import Account
+from factorgraph_dvl.files.importing.acoustic import located
 from factorgraph_dvl.files.importing.assembly import (
     SUFFIX,
     assemble,
@@ -26,6 +27,7 @@ from factorgraph_dvl.files.importing.assembly import (
     yaml_text,
 )
 from factorgraph_dvl.files.importing.decisions import LOG_FILE, Decisions, digest_in
+from factorgraph_dvl.files.importing.packed import unpacked
 from factorgraph_dvl.files.importing.recognition import by_name, check_installed, recognise
 from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.importing.time_base import on_utc
@@ -55,7 +57,7 @@ def import_files(
     Parameters
     ----------
     files : sequence of path-like
-        In any order; their names do not matter.
+        In any order; their names do not matter. Those that end in `.gz` are unpacked.
     out : path-like
         Trial folder to write.
     form : str, optional
@@ -81,17 +83,28 @@ def import_files(
     decisions = Decisions()
     say = progress or (lambda text: None)
     kept = edited_settings(out)
-    with claim(out, force=force, owned=OWNED, inputs=files):
-        formats = [_formats_of(Path(path), form, mapping) for path in files]
+    with (
+        claim(out, force=force, owned=OWNED, inputs=files),
+        unpacked([Path(path) for path in files], decisions) as paths,
+    ):
+        formats = [_formats_of(path, form, mapping) for path in paths]
         with new_folder(out, force=force, owned=OWNED) as folder:
             spool_folder = folder / _SPOOL
             spool_folder.mkdir()
             spool = Spool(spool_folder, decisions.add, decisions.warn)
-            for path, found in zip(files, formats, strict=True):
-                _read(Path(path), found, spool, mapping, decisions, say)
-            streams = on_utc(spool.streams(), spool, decisions)
+            useless = [
+                error
+                for path, found in zip(paths, formats, strict=True)
+                if (error := _read(path, found, spool, mapping, decisions, say)) is not None
+            ]
+            if len(useless) == len(files):
+                raise useless[0]
+            for error in useless:
+                decisions.warn(f"{error.where}: {error.what}")
+            _mention_settings([Path(path) for path in files], formats, decisions)
+            streams = located(on_utc(spool.streams(), spool, decisions), spool, decisions)
             say("assemble")
-            name = as_text(Path(files[0]).stem)
+            name = as_text(paths[0].stem)
             assembly, epoch = assemble(streams, name, decisions)
             _override(assembly.settings, {} if mapping is None else mapping.trial)
             write_tables(assembly, epoch, folder)
@@ -118,6 +131,22 @@ def edited_settings(out: Path) -> bytes | None:
     return None if same else text
 
 
+def _mention_settings(
+    files: Sequence[Path], formats: Sequence[tuple[Format, ...]], decisions: Decisions
+) -> None:
+    """Name files of WinRiver that lie beside a PD0 file and were not given."""
+    given = {file.resolve() for file in files}
+    folders = {
+        path.parent
+        for path, found in zip(files, formats, strict=True)
+        if any(form.name == "pd0" for form in found)
+    }
+    for folder in sorted(folders):
+        for beside in sorted(folder.glob("*.mmt")):
+            if beside.resolve() not in given:
+                decisions.add(beside.name, "lies beside and was not given: it may say more")
+
+
 def _formats_of(path: Path, form: str, mapping: MappingSettings | None) -> tuple[Format, ...]:
     found: tuple[Format, ...]
     if form:
@@ -138,7 +167,8 @@ def _read(
     mapping: MappingSettings | None,
     decisions: Decisions,
     say: Progress,
-) -> None:
+) -> DataError | None:
+    """Read a file; return the error if it holds nothing, which other files may make up for."""
     size = path.stat().st_size
     decisions.add(path.name, " and ".join(form.title for form in formats) + f", {size} bytes")
     # Text is looked through once, whatever formats stand in it.
@@ -161,16 +191,17 @@ def _read(
     account = Account(path.name, spool.tallies(path.name))
     has_records = bool(account.types)
     account.include(losses)
-    if not has_records:
-        raise DataError(
-            "contains no data that a trial can use",
-            where=path.name,
-            expected="velocities, positions, attitude, depth, or the samples of an IMU",
-            hint="; ".join(account.lines()[:_SHOWN]),
-        )
     decisions.accounts.append(account)
     for text in account.warnings():
         decisions.warn(text)
+    if has_records:
+        return None
+    return DataError(
+        "contains no data that a trial can use",
+        where=path.name,
+        expected="velocities, positions, attitude, depth, or the samples of an IMU",
+        hint="; ".join(account.lines()[:_SHOWN]),
+    )
 
 
 def _override(settings: dict[str, Any], stated: Mapping[str, Any]) -> None:

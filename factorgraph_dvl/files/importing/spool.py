@@ -22,7 +22,6 @@ from factorgraph_dvl.files.formats.format import (
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.formats.losses import STATUS
 from factorgraph_dvl.files.importing.account import Tally
-from factorgraph_dvl.geometry.vectors import Array
 
 # Records at a time. Chosen: some MB.
 CHUNK = 50_000
@@ -207,13 +206,13 @@ class Spool:
             self._warn(_NEVER_SET.format(file=file, kind=type_name(key[2], key[4]), count=count))
         return {kind: tally for (name, kind), tally in self._tallies.items() if name == file}
 
-    def store(self, parts: Iterable[Array]) -> Stored:
-        """Write numbers, part by part."""
-        path = self._new()
+    def store(self, parts: Iterable[Records], kind: np.dtype[Any] | None = None) -> Stored:
+        """Write numbers, or records of a kind, part by part."""
+        path, kind = self._new(), np.dtype(float) if kind is None else kind
         with path.open("wb") as file:
             for part in parts:
-                file.write(np.ascontiguousarray(part, float).tobytes())
-        return Stored(path, np.dtype(float))
+                file.write(np.ascontiguousarray(part, kind).tobytes())
+        return Stored(path, kind)
 
     def streams(self) -> list[Stream]:
         """Return what was added, in the order of the first records."""

@@ -172,7 +172,7 @@ def _std(sample: Records, label: str, decisions: Decisions) -> float:
         value = max(_LEAST_STD, round(spread, 4))
         decisions.add(
             label,
-            f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s",
+            f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s → {value:g}",
             "dvl.velocity_std_m_s",
         )
         return value

@@ -12,12 +12,12 @@ import yaml
 
 from factorgraph_dvl.cli.exit_codes import exit_code_of
 from factorgraph_dvl.errors import ConfigError, DataError
-from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, ulog
+from factorgraph_dvl.files.formats.vehicles import ardupilot, bags, nucleus, telemetry, ulog
 from factorgraph_dvl.files.formats.vehicles.library import load
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 
 DEG = np.pi / 180.0
-MODULES = (bags, ardupilot, ulog, nucleus)
+MODULES = (bags, ardupilot, ulog, telemetry, nucleus)
 
 
 def needs(module):
@@ -327,6 +327,80 @@ def test_ardupilot_keeps_what_follows_damage(tmp_path):
     assert len(found["imu", "IMU[0]"]) == 40
     assert notes[-1] == "1.BIN: 810 bytes are in no message"
     assert [entry.name for entry in tmp_path.iterdir()] == ["1.BIN"]
+
+
+def test_telemetry(tmp_path):
+    needs(telemetry)
+    path = write(tmp_path / "1.tlog", logs.telemetry_trial())
+    assert telemetry.share(path, path.read_bytes()) == pytest.approx(1.0, abs=0.02)
+    found, batches, notes = read(telemetry, path)
+    imu = found["imu", "RAW_IMU 1:1"]
+    # The least delay is 20 ms; what is late is not late by its own clock.
+    times = logs.START + 0.02 + 0.1 * np.arange(40)
+    np.testing.assert_allclose(imu["time"], times, atol=1e-5)
+    np.testing.assert_allclose(imu["received"], times, atol=1e-5)
+    np.testing.assert_allclose(imu["gyro"][:, 2], 0.03 + 0.001 * np.arange(40))
+    np.testing.assert_allclose(imu["accel"][0], np.array((0.1, -0.05, -1.0)) * 9.80665)
+    assert batches["imu", "RAW_IMU 1:1"].axes == "FRD"
+    attitude = found["attitude", "ATTITUDE 1:1"][3]
+    angles = [attitude[n] for n in ("roll", "pitch", "heading")]
+    np.testing.assert_allclose(angles, [0.1, -0.2, 2.0 * np.pi - 0.5], rtol=1e-6)
+    np.testing.assert_allclose(found["depth", "SCALED_PRESSURE2 1:1"]["depth"], 5.0)
+    fix = found["fix", "GPS_INPUT 1:220"]
+    utc = 1586044800 + 345600 - 18
+    np.testing.assert_allclose(fix["time"], utc + 0.1 * np.arange(40), atol=1e-6)
+    np.testing.assert_allclose(fix["lat"][1] / DEG, 54.0000002, atol=1e-10)
+    np.testing.assert_allclose(fix["altitude"], -4.5)
+    np.testing.assert_allclose(fix["velocity"], [[0.2, 0.1, np.nan]] * 40, rtol=1e-6)
+    np.testing.assert_allclose(fix["std"], [[1.5, 1.5, 2.5]] * 40)
+    np.testing.assert_allclose(fix["velocity_std"], 0.4, rtol=1e-6)
+    dvl = found["dvl", "VISION_POSITION_DELTA 1:191"]
+    np.testing.assert_allclose(dvl["velocity"], [[1.0, -0.2, 0.1]] * 40, rtol=1e-6)
+    np.testing.assert_allclose(dvl["delay"], -0.05)
+    np.testing.assert_allclose(dvl["time"], times, atol=1e-5)
+    clock = found["clock", "SYSTEM_TIME 1:1"]
+    np.testing.assert_allclose(clock["time"], times - 0.02, atol=1e-5)
+    assert ("fix", "GPS_RAW_INT 1:1") not in found
+    assert any("repeats" in note for note in notes)
+
+
+def test_positions_of_telemetry_without_those_that_it_was_given(tmp_path):
+    needs(telemetry)
+    found, _, _ = read(telemetry, write(tmp_path / "1.tlog", logs.telemetry_trial(gps=False)))
+    fix = found["fix", "GPS_RAW_INT 1:1"]
+    assert np.isnan(fix["lat"][0]), "the first has no fix"
+    np.testing.assert_allclose(fix["lat"][2] / DEG, 54.0000003, atol=1e-10)
+    np.testing.assert_allclose((fix["altitude"], fix["height"]), [[4.0] * 40, [52.0] * 40])
+    np.testing.assert_allclose(fix["std"], [[0.5, 0.5, 0.9]] * 40)
+    course = found["course", "GPS_RAW_INT 1:1"]
+    np.testing.assert_allclose(course["speed"], [np.nan] + [2.5] * 39)
+    np.testing.assert_allclose(course["course"] / DEG, 90.0)
+    estimate = found["fix", "GLOBAL_POSITION_INT 1:1"]
+    np.testing.assert_allclose(estimate["velocity"], [[0.1, 0.2, 0.3]] * 40)
+    np.testing.assert_allclose(estimate["quality"], 6.0)
+
+
+def test_telemetry_of_a_vehicle_that_starts_anew_and_damage(tmp_path):
+    needs(telemetry)
+    first = logs.telemetry_trial()
+    second = bytearray(logs.telemetry_trial(start=logs.START + 600.0, boot=5.0))
+    second[300] ^= 1
+    data = first[:-9] + b"\xfd\xfe garbage" + bytes(second)
+    found, _, _ = read(telemetry, write(tmp_path / "1.tlog", data))
+    time = found["attitude", "ATTITUDE 1:1"]["time"]
+    expected = logs.START + 0.02 + np.concatenate([0.1 * np.arange(40), 600 + 0.1 * np.arange(40)])
+    assert 78 <= len(time) <= 80
+    assert np.abs(time[:, None] - expected).min(axis=1).max() < 1e-5
+    losses = [batch.losses for batch in telemetry.read(tmp_path / "1.tlog") if batch.losses]
+    assert "message with a wrong checksum" in losses[-1].counts
+    assert losses[-1].counts["byte outside records"] > 9
+
+
+def test_an_imu_that_is_not_there_has_no_values(tmp_path):
+    needs(telemetry)
+    data = logs.telemetry("RAW_IMU", logs.START, 1000, *[0] * 9, 0, 0) * 3
+    found, _, _ = read(telemetry, write(tmp_path / "1.tlog", data))
+    assert np.isnan(found["imu", "RAW_IMU 1:1"]["accel"]).all()
 
 
 def test_px4(tmp_path):

@@ -8,9 +8,10 @@ from datetime import UTC, datetime
 import format_writers as writers
 import numpy as np
 import pytest
-from format_samples import PD13, SERIAL, WHEN, rowe_ensemble
+from format_samples import PD13, SERIAL, WHEN, rowe_ensemble, stamped_lines
 from format_writers import nmea
 
+from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
 from factorgraph_dvl.files.formats.pd4 import read_pd4
 from factorgraph_dvl.files.formats.pd6 import read_pd6
@@ -19,6 +20,7 @@ from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SH
 from factorgraph_dvl.files.formats.water_linked import FORMATS as WATER_LINKED
 from factorgraph_dvl.files.formats.water_linked import crc8, read_water_linked
 from factorgraph_dvl.files.formats.water_linked_table import FORMATS as WATER_LINKED_TABLES
+from factorgraph_dvl.files.importing.recognition import recognise
 
 DEG = np.pi / 180.0
 
@@ -323,3 +325,38 @@ def test_rowe():
         [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 181], atol=1e-5
     )
     assert sentences["HDT"]["received"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
+
+
+def test_pd6_through_the_water(tmp_path):
+    lines = (":SA, +1.50, -2.25,181.02\n:WS, +120,  -30,   +5,A\n:WI, +100, -200,   +3,  +4,A\n"
+             ":BI, +500, -600,   +7,  +8,A\n")  # fmt: skip
+    path = tmp_path / "a.pd6"
+    path.write_text(lines * 3)
+    (form,) = (form for form in FORMATS if form.name == "pd6")
+    batches = {batch.kind: batch.records for batch in form.read(path, None) if len(batch.records)}
+    np.testing.assert_allclose(batches["water"]["velocity"], [[0.1, -0.2, 0.003]] * 3)
+    np.testing.assert_allclose(batches["dvl"]["velocity"], [[0.5, -0.6, 0.007]] * 3)
+    (found,) = read_pd6(b":SA,1,2,3\n:WI,1,2,3,4,V\n", track="W")
+    assert np.isnan(found["velocity"]).all()
+
+
+def test_pd6_with_stamps(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_bytes(stamped_lines())
+    assert [form.name for form in recognise(path)] == ["pd6-table"]
+    (form,) = recognise(path)
+    batches = list(form.read(path, None))
+    found = {batch.kind: batch.records for batch in batches if len(batch.records)}
+    dvl = found["dvl"]
+    np.testing.assert_allclose(dvl["time"], 300.0 + 0.1 * np.arange(40), atol=1e-9)
+    expected = 0.1 + 0.001 * np.arange(40)
+    # One is invalid, and two have lost a digit.
+    expected[[5, 7, 27]] = np.nan
+    np.testing.assert_allclose(dvl["velocity"][:, 0], expected)
+    np.testing.assert_allclose(found["water"]["velocity"][:, 1], -0.001 * np.arange(40))
+    np.testing.assert_allclose(found["attitude"]["heading"] / DEG % 360, 181.0 + np.arange(40))
+    lines = path.read_bytes().split(b"\n")
+    assert lines[3].startswith(path.read_bytes()[dvl["at"][0] :][:20])
+    losses = batches[-1].losses
+    assert losses.counts == {"line of no type": 1, "line of another length": 2}
+    assert losses.skipped == {":CS": {"type not read": 1}}

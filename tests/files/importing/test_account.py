@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
 import json
 import re
+from collections import Counter
 from functools import partial
 from pathlib import Path
 
 import format_fuzz as fuzz
+import format_logs as logs
 import format_writers as writers
 import numpy as np
 import pytest
+import yaml
 from running import run  # noqa: F401
 
 from factorgraph_dvl.files.formats.catalogue import FORMATS
@@ -220,6 +225,96 @@ class TestRecordings:
             name.partition("[")[0]: sum(count) for name, count in found.items() if count != (0, 0)
         } == counts
 
+    def test_telemetry(self, tmp_path):
+        library = pytest.importorskip("pymavlink.mavutil")
+        found = self.accounted(tmp_path, "ardusub_small.tlog")
+        log = library.mavlink_connection(str(RECORDINGS / "ardusub_small.tlog"))
+        counts, ours = {}, {}
+        for message in iter(log.recv_match, None):
+            counts[message.get_type()] = counts.get(message.get_type(), 0) + 1
+        log.close()
+        for name, count in found.items():
+            kind = name.partition(" ")[0]
+            ours[kind] = ours.get(kind, 0) + sum(count)
+        ours["BAD_DATA"] = ours.pop("damaged")
+        assert ours == counts
+
+    def test_underwater_gps(self, tmp_path):
+        """Counts by the module csv."""
+        parts = ("g2_acoustic", "g2_position", "g2_orientation", "nmea_GGA", "nmea_HDT")
+        files, tables = [], []
+        for part in parts:
+            packed = RECORDINGS / f"ugps_g2_{part}.csv.gz"
+            if not packed.is_file():
+                pytest.skip(f"no recording {packed.name}")
+            files.append(tmp_path / f"{part}.csv")
+            files[-1].write_bytes(gzip.decompress(packed.read_bytes()))
+            tables.append(list(csv.DictReader(files[-1].read_text().splitlines())))
+        decisions = import_files(files, tmp_path / "trial")
+        found = [
+            {kind: (read, skipped) for kind, read, skipped, _ in account.rows()}
+            for account in decisions.accounts
+        ]
+        contents = [[v for k, v in row.items() if k != "timestamp"] for row in tables[0]]
+        new = [i for i, row in enumerate(contents) if not i or row != contents[i - 1]]
+        valid = [i for i in new if tables[0][i]["position_valid"] == "True"]
+        assert found[0]["locator (acoustic)"] == (len(valid), len(new) - len(valid))
+        assert found[0]["row"] == (0, len(contents) - len(new))
+        assert found[1] == {"position (topside)": (len(tables[1]), 0)}
+        assert found[2] == {"orientation of the housing": (0, len(tables[2]))}
+        assert found[3]["GGA (topside)"] == found[3]["GGA (clock)"] == (len(tables[3]), 0)
+        assert found[4] == {"HDT (topside)": (len(tables[4]), 0)}
+        assert 1700 < len(valid) < 1800
+
+    def test_pd6_table(self, tmp_path):
+        """Counts by the module csv."""
+        packed = RECORDINGS / "h1000_pd6_pool.csv.gz"
+        if not packed.is_file():
+            pytest.skip(f"no recording {packed.name}")
+        path = tmp_path / "a.csv"
+        path.write_bytes(gzip.decompress(packed.read_bytes()))
+        decisions = import_files([path], tmp_path / "trial")
+        found = {kind: (read, skipped) for kind, read, skipped, _ in decisions.accounts[0].rows()}
+        text = path.read_text().rstrip("\0").splitlines()
+        lines = [row["RawLine"] for row in csv.DictReader(text)]
+        counts = {}
+        for line in lines:
+            counts.setdefault(line[:4], Counter())[len(line)] += 1
+        whole = {kind: lengths.most_common(1)[0][1] for kind, lengths in counts.items()}
+        for kind in (":TS", ":BI", ":BS", ":BE", ":BD"):
+            assert sum(found[kind]) == whole[kind + ","]
+        assert sum(found["dvl"]) == whole[":SA,"] == 6183
+        typed = sum(sum(c.values()) for k, c in counts.items() if re.fullmatch(":[A-Z]{2},", k))
+        cut = typed - sum(n for kind, n in whole.items() if re.fullmatch(":[A-Z]{2},", kind))
+        # The rest of the file is zeros.
+        assert found["damaged"] == (0, len(lines) - typed + cut + 1)
+
+    @pytest.mark.parametrize(
+        ("name", "lacks"),
+        [
+            ("nucleus_at_rest.nucleus", ["positions", "velocities: 266 pings, and none"]),
+            ("water_linked_a50.json", ["positions", "velocities: 232 pings", "attitude"]),
+            ("h1000_pd6_pool.csv.gz", ["positions"]),
+            ("ardusub_small.BIN", ["positions", "velocities: 0 pings"]),
+            ("ardusub_small.tlog", ["velocities: 0 pings"]),
+            ("px4_small.ulg", ["velocities: 0 pings"]),
+            ("rowe_boat_turns.ens", []),
+        ],
+    )
+    def test_what_is_missing_for_a_calibration_is_said(self, tmp_path, name, lacks):
+        path = RECORDINGS / name
+        if not path.is_file():
+            pytest.skip(f"no recording {name}")
+        if path.suffix == ".gz":
+            packed, path = path, tmp_path / path.stem
+            path.write_bytes(gzip.decompress(packed.read_bytes()))
+        for form in FORMATS:
+            if form.module and path.suffix.lower() in form.endings:
+                pytest.importorskip(form.module.partition(".")[0])
+        missing = import_files([path], tmp_path / "trial").missing
+        assert len(missing) == len(lacks)
+        assert all(text.startswith(start) for text, start in zip(missing, lacks, strict=True))
+
     def test_ulog(self, tmp_path):
         pyulog = pytest.importorskip("pyulog")
         found = self.accounted(tmp_path, "px4_small.ulg")
@@ -230,3 +325,19 @@ class TestRecordings:
             topic = name.partition("[")[0]
             ours[topic] = ours.get(topic, 0) + sum(count)
         assert ours == counts
+
+
+@pytest.mark.parametrize(("step", "used"), [(0.05, "imu"), (0.25, "attitude")])
+def test_an_imu_that_is_too_slow_gives_way_to_an_attitude(tmp_path, step, used):
+    pytest.importorskip("pymavlink")
+    data = b""
+    for i in range(20):
+        own = 100.0 + step * i
+        at = logs.START + own
+        data += logs.telemetry("RAW_IMU", at, round(own * 1e6), 1, 2, -1000, *[0] * 8)
+        data += logs.telemetry("ATTITUDE", at, round(own * 1e3), 0.1, 0.2, 0.3, 0, 0, 0)
+    (tmp_path / "a.tlog").write_bytes(data)
+    decisions = import_files([tmp_path / "a.tlog"], tmp_path / "trial")
+    sections = yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text())
+    assert {"imu", "attitude"} & set(sections) == {used}
+    assert ("do not show how" in decisions.text("")) is (used == "attitude")

@@ -496,3 +496,35 @@ trial: {dvl: {lever_arm_m: [1, 2, 3]}}
         path.write_text("a,b\n1,2\n")
         with pytest.raises(DataError, match="is recognised"):
             guess_all([path])
+
+
+@pytest.mark.parametrize(
+    ("files", "variation"),
+    [
+        ((("other.PD0", 7.0), ("A.pd0", -3.25)), "-3.25"),
+        ((("other.PD0", 7.0),), "+7.00"),
+        ((("b.PD0", 7.0), ("c.PD0", 8.0)), None),
+    ],
+)
+def test_the_variation_that_was_set_in_winriver(tmp_path, files, variation):
+    # The heading is that of a compass inside.
+    pings = b"".join(samples.ensemble(i, sensors=0b10000) for i in range(20))
+    (tmp_path / "a.PD0").write_bytes(pings)
+    (tmp_path / "a.mmt").write_bytes(samples.winriver_settings(*files))
+    without = import_files([tmp_path / "a.PD0"], tmp_path / "first")
+    decisions = import_files([tmp_path / "a.PD0", tmp_path / "a.mmt"], tmp_path / "trial")
+    text = decisions.text("")
+    assert f"{files[0][0]}: magnetic variation {files[0][1]:g}°, transducer 0.25 m" in text
+    first, second = (
+        read_table(tmp_path / name / "attitude.parquet", ["heading_deg"])["heading_deg"]
+        for name in ("first", "trial")
+    )
+    if variation is None:
+        assert "several magnetic variations were set" in text
+        np.testing.assert_allclose(second, first)
+    else:
+        assert f"the variation that was set, {variation}°" in text
+        np.testing.assert_allclose((second - first + 180) % 360 - 180, float(variation))
+    assert "no position" in without.text("")
+    assert "a.mmt: lies beside and was not given" in without.text("")
+    assert "lies beside" not in text

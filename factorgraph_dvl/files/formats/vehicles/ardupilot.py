@@ -16,19 +16,23 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.clocks import gps_to_utc
 from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out, positive
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file
+from factorgraph_dvl.files.formats.framing import BLOCK, Source, map_file
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
+    FIRST_WEEK,
+    Row,
     column,
     columns,
     gga_quality,
     given_up,
     load,
+    locate,
+    movements,
     quiet,
     silently,
+    started,
     unreadable,
 )
-from factorgraph_dvl.files.formats.velocities import INSTRUMENT
 from factorgraph_dvl.geometry.units import DEG, MICROSECOND
 
 _SYNC = b"\xa3\x95"
@@ -48,10 +52,6 @@ _SIZES |= {
     "q": 8,
     "Q": 8,
 }
-# Before the first of 2012 no ArduPilot log had weeks in its GPS messages.
-_FIRST_WEEK = 1669
-# Values of one message by the names of its columns.
-Row = dict[str, Any]
 
 
 def share(path: Path, sample: bytes) -> float:
@@ -64,23 +64,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read the messages IMU, GPS with GPA, ATT and VISO; others are passed over.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If pymavlink is not installed.
-    DataError
-        If the file cannot be read at all.
+    Parameters, result and errors are those of `Format.read`.
     """
     library = load("pymavlink.DFReader", "ardupilot")
     source = map_file(path)
@@ -200,21 +184,19 @@ def _next(log: Any) -> Row | None:
     return None if message is None else message.to_dict()
 
 
-def _started(out: Records, rows: list[Row]) -> Records:
-    out["at"] = column(rows, "at")
-    out["received"] = out["time"] = column(rows, "TimeUS") * MICROSECOND
-    return out
+def _time(rows: list[Row]) -> dict[str, Any]:
+    return {"at": column(rows, "at"), "time": column(rows, "TimeUS") * MICROSECOND}
 
 
 def _imu(stream: str, rows: list[Row]) -> Batch:
-    out = _started(empty("imu", len(rows)), rows)
+    out = started(empty("imu", len(rows)), **_time(rows))
     out["gyro"] = columns(rows, "GyrX", "GyrY", "GyrZ")
     out["accel"] = columns(rows, "AccX", "AccY", "AccZ")
     return Batch("imu", out, "own", stream, "FRD")
 
 
 def _attitude(stream: str, rows: list[Row]) -> Batch:
-    out = _started(empty("attitude", len(rows)), rows)
+    out = started(empty("attitude", len(rows)), **_time(rows))
     rph = columns(rows, "Roll", "Pitch", "Yaw") * DEG
     out["roll"], out["pitch"], out["heading"] = rph.T
     note = "ATT: the filter of the autopilot; whether its compass is true depends on its setup"
@@ -222,15 +204,14 @@ def _attitude(stream: str, rows: list[Row]) -> Batch:
 
 
 def _fix(stream: str, rows: list[Row]) -> Batch:
-    out = _started(empty("fix", len(rows)), rows)
+    out = started(empty("fix", len(rows)), **_time(rows))
     week = column(rows, "GWk")
     utc = gps_to_utc(week, column(rows, "GMS") * 1e-3)
-    out["time"] = np.where(week >= _FIRST_WEEK, utc, np.nan)
-    lat, lon = column(rows, "Lat") * DEG, column(rows, "Lng") * DEG
-    out["lat"], out["lon"], out["altitude"] = lat, lon, column(rows, "Alt")
+    out["time"] = np.where(week >= FIRST_WEEK, utc, np.nan)
+    locate(out, column(rows, "Lat"), column(rows, "Lng"), gga_quality(column(rows, "Status")))
+    out["altitude"] = column(rows, "Alt")
     accuracy = [row["accuracy"] for row in rows]
     out["height"] = out["altitude"] + column(accuracy, "Und")
-    out["quality"] = gga_quality(column(rows, "Status"))
     speed, course = column(rows, "Spd"), column(rows, "GCrs") * DEG
     up = -column(rows, "VZ")
     out["velocity"] = np.stack([speed * np.sin(course), speed * np.cos(course), up], axis=1)
@@ -241,15 +222,9 @@ def _fix(stream: str, rows: list[Row]) -> Batch:
 
 def _odometry(stream: str, rows: list[Row]) -> Batch:
     """`VISO`, as which vehicles under water log their DVL: movements over intervals."""
-    out = _started(empty("dvl", len(rows)), rows)
-    interval = column(rows, "dt")
+    out = started(empty("dvl", len(rows)), **_time(rows))
     # ArduPilot takes seconds here and microseconds in the MAVLink message that it comes from.
-    good = (interval > 0.0) & (interval < 100.0)
-    interval = np.where(good, interval, np.nan)
-    out["velocity"] = columns(rows, "PosDX", "PosDY", "PosDZ") / interval[:, None]
-    out["axes"], out["delay"] = INSTRUMENT, -0.5 * interval
-    note = "VISO: movements over intervals, taken as the mean velocity of a DVL in the body's axes"
-    return Batch("dvl", out, "own", stream, "FRD", notes=(note,))
+    return movements(out, columns(rows, "PosDX", "PosDY", "PosDZ"), column(rows, "dt"), stream)
 
 
 _CONVERTERS = {"IMU": _imu, "ATT": _attitude, "GPS": _fix, "VISO": _odometry}

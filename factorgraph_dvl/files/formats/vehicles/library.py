@@ -13,11 +13,21 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.formats.format import Batch
+from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.formats.velocities import INSTRUMENT
+from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
 # Kinds of fixes in autopilots (none, no fix, 2D, 3D, differential, RTK float, RTK fixed) to GGA's
 # numbers.
 _QUALITY = np.array([0.0, 0.0, 0.0, 1.0, 2.0, 5.0, 4.0])
+# Before the first of 2012 no autopilot logged weeks of GPS.
+FIRST_WEEK = 1669
+# Longest interval of a movement, s: in microseconds it would be more.
+_LONGEST_INTERVAL = 100.0
+_MOVEMENTS = "{}: movements over intervals, taken as the mean velocity of a DVL in the body's axes"
+# Values of one message by the names of its columns.
+Row = dict[str, Any]
 
 
 def load(module: str, extra: str) -> Any:
@@ -72,6 +82,53 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> Array:
 def columns(rows: Sequence[Mapping[str, Any]], *names: str) -> Array:
     """Return several columns side by side, (N, M)."""
     return np.stack([column(rows, name) for name in names], axis=1)
+
+
+def started(out: Records, *, at: Any, time: Array, received: Array | None = None) -> Records:
+    """Return records with their positions in the file and their times.
+
+    Parameters
+    ----------
+    out : Records
+        (N,) of any kind.
+    at : array_like of int, shape (N,)
+        Positions in the file.
+    time : ndarray, shape (N,), s
+        On the clock of the batch.
+    received : ndarray, shape (N,), s, optional
+        On the recording clock; `time` without.
+    """
+    out["at"], out["time"] = at, time
+    out["received"] = time if received is None else received
+    return out
+
+
+def locate(out: Records, lat: Array, lon: Array, quality: Array) -> None:
+    """Write latitudes and longitudes, deg (N,), into fixes; those of quality 0 have no place."""
+    out["quality"] = quality
+    for name, values in (("lat", lat), ("lon", lon)):
+        out[name] = np.where(quality > 0.0, values * DEG, np.nan)
+
+
+def movements(out: Records, delta: Array, interval: Array, stream: str) -> Batch:
+    """Return pings of movements over intervals, as which vehicles under water log their DVL.
+
+    Parameters
+    ----------
+    out : Records
+        (N,) pings with their times, at the ends of the intervals.
+    delta : ndarray, shape (N, 3), m
+        Movements in forward, right, down.
+    interval : ndarray, shape (N,), s
+        Over which they were.
+    stream : str
+        As in `Batch`.
+    """
+    good = (interval > 0.0) & (interval < _LONGEST_INTERVAL)
+    interval = np.where(good, interval, np.nan)
+    out["velocity"] = delta / interval[:, None]
+    out["axes"], out["delay"] = INSTRUMENT, -0.5 * interval
+    return Batch("dvl", out, "own", stream, "FRD", notes=(_MOVEMENTS.format(stream),))
 
 
 def gga_quality(kind: Array) -> Array:

@@ -17,9 +17,15 @@ from factorgraph_dvl.files.formats.ad2cp import NUCLEUS, frames
 from factorgraph_dvl.files.formats.format import Batch, Clock, Format, Kind, empty, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, map_file
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
-from factorgraph_dvl.files.formats.vehicles.library import column, columns, load, silently
+from factorgraph_dvl.files.formats.vehicles.library import (
+    column,
+    columns,
+    load,
+    silently,
+    started,
+)
 from factorgraph_dvl.files.formats.velocities import INSTRUMENT
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.units import DEG, MICROSECOND
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
 # A calibration must not be compared with what was made of the same data.
@@ -57,23 +63,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read IMU, AHRS, bottom track and water track packets.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If nucleus-driver is not installed.
-    DataError
-        If the file cannot be read.
+    Parameters, result and errors are those of `Format.read`.
     """
     # The parser alone: the driver around it opens sockets.
     parser = load("nucleus_driver._parser", "nucleus").Parser(messages=_Silent())
@@ -110,10 +100,8 @@ def _decoded(parser: Any, frame: bytearray) -> Packet | None:
 
 
 def _timed(kind: Kind, packets: list[Packet]) -> tuple[Records, Clock]:
-    out = empty(kind, len(packets))
-    out["at"] = [packet["at"] for packet in packets]
-    out["time"] = column(packets, "timeStamp") + column(packets, "microSeconds") * 1e-6
-    out["received"] = out["time"]
+    time = column(packets, "timeStamp") + column(packets, "microSeconds") * MICROSECOND
+    out = started(empty(kind, len(packets)), at=column(packets, "at"), time=time)
     return out, "utc" if column(packets, "flags.posixTime").all() else "own"
 
 

@@ -16,17 +16,19 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out, positive
-from factorgraph_dvl.files.formats.framing import Records, Source, map_file
+from factorgraph_dvl.files.formats.framing import Source, map_file
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
     gga_quality,
     load,
+    locate,
     quiet,
     silently,
+    started,
     unreadable,
 )
 from factorgraph_dvl.files.formats.velocities import INSTRUMENT
-from factorgraph_dvl.geometry.units import DEG, MICROSECOND
+from factorgraph_dvl.geometry.units import MICROSECOND
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.files import open_file
 
@@ -48,23 +50,7 @@ def share(path: Path, sample: bytes) -> float:
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read the messages in `CONVERTERS`; others are passed over.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    mapping : mapping, optional
-        Not used.
-
-    Yields
-    ------
-    Batch
-
-    Raises
-    ------
-    ConfigError
-        If pyulog is not installed.
-    DataError
-        If the file cannot be read.
+    Parameters, result and errors are those of `Format.read`.
     """
     library = load("pyulog", "px4")
     expected = "a ULog file of PX4"
@@ -127,12 +113,11 @@ def _vectors(columns: Columns, name: str, count: int = 3) -> Array:
     return np.stack([_column(columns, f"{name}[{i}]") for i in range(count)], axis=1)
 
 
-def _started(out: Records, columns: Columns) -> Records:
-    out["at"] = np.arange(len(out))
-    out["received"] = _column(columns, "timestamp") * MICROSECOND
+def _time(columns: Columns) -> dict[str, Any]:
+    received = _column(columns, "timestamp") * MICROSECOND
     stamps = _column(columns, "timestamp_sample") * MICROSECOND
-    out["time"] = np.where(stamps > 0.0, stamps, out["received"])
-    return out
+    time = np.where(stamps > 0.0, stamps, received)
+    return {"at": np.arange(len(received)), "time": time, "received": received}
 
 
 def _count(columns: Columns) -> int:
@@ -140,14 +125,14 @@ def _count(columns: Columns) -> int:
 
 
 def _imu(stream: str, columns: Columns) -> Batch:
-    out = _started(empty("imu", _count(columns)), columns)
+    out = started(empty("imu", _count(columns)), **_time(columns))
     out["gyro"] = _vectors(columns, "gyro_rad")
     out["accel"] = _vectors(columns, "accelerometer_m_s2")
     return Batch("imu", out, "own", stream, "FRD")
 
 
 def _attitude(stream: str, columns: Columns) -> Batch:
-    out = _started(empty("attitude", _count(columns)), columns)
+    out = started(empty("attitude", _count(columns)), **_time(columns))
     q = _vectors(columns, "q", 4)
     good = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0.5)
     # PX4 has the scalar first; the rotation takes the body to north, east, down.
@@ -160,18 +145,18 @@ def _attitude(stream: str, columns: Columns) -> Batch:
 
 
 def _fix(stream: str, columns: Columns) -> Batch:
-    out = _started(empty("fix", _count(columns)), columns)
+    out = started(empty("fix", _count(columns)), **_time(columns))
     utc = _column(columns, "time_utc_usec") * MICROSECOND
     out["time"] = np.where(utc > _EARLIEST, utc, np.nan)
     # Before version 1.14 positions were integers of 1e-7 degrees and of millimetres.
     units = (1e-7, 1e-3) if "lat" in columns else (1.0, 1.0)
-    out["lat"] = _column(columns, "latitude_deg", "lat") * units[0] * DEG
-    out["lon"] = _column(columns, "longitude_deg", "lon") * units[0] * DEG
-    out["altitude"] = _column(columns, "altitude_msl_m", "alt") * units[1]
-    out["height"] = _column(columns, "altitude_ellipsoid_m", "alt_ellipsoid") * units[1]
+    lat = _column(columns, "latitude_deg", "lat") * units[0]
+    lon = _column(columns, "longitude_deg", "lon") * units[0]
     kind = _column(columns, "fix_type")
     # The last is extrapolated.
-    out["quality"] = np.where(kind == 8.0, 6.0, gga_quality(kind))
+    locate(out, lat, lon, np.where(kind == 8.0, 6.0, gga_quality(kind)))
+    out["altitude"] = _column(columns, "altitude_msl_m", "alt") * units[1]
+    out["height"] = _column(columns, "altitude_ellipsoid_m", "alt_ellipsoid") * units[1]
     north, east, down = (_column(columns, f"vel_{axis}_m_s") for axis in "ned")
     velocity = np.stack([east, north, -down], axis=1)
     valid = _column(columns, "vel_ned_valid") != 0.0
@@ -184,7 +169,7 @@ def _fix(stream: str, columns: Columns) -> Batch:
 
 def _odometry(stream: str, columns: Columns) -> Batch:
     """`vehicle_visual_odometry`, as which vehicles under water log their DVL."""
-    out = _started(empty("dvl", _count(columns)), columns)
+    out = started(empty("dvl", _count(columns)), **_time(columns))
     in_body = _column(columns, "velocity_frame") == 3.0
     out["velocity"] = np.where(in_body[:, None], _vectors(columns, "velocity"), np.nan)
     variance = _vectors(columns, "velocity_variance")

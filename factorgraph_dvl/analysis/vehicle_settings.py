@@ -1,0 +1,255 @@
+"""A calibration as the settings of a vehicle or an instrument, in the form in which these read it.
+
+Each function states the sign convention of who reads the settings, and from which document.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms, instrument_of
+from factorgraph_dvl.analysis.mount import mount_in_words
+from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.quality.verdict import Grade
+from factorgraph_dvl.sensors.dvl import TIME_OFFSET
+from factorgraph_dvl.solution import Calibration, Solution
+
+# Forward, starboard, down to forward, port, up.
+_FLU = np.diag([1.0, -1.0, -1.0])
+# Why a value must not be entered, by its grade.
+_REFUSED = {
+    "red": "σ is more than twice its limit: do not enter",
+    "grey": "the trial did not determine it: do not enter",
+}
+# Yaw of a sensor in the vehicle, deg, by the number of its rotation in ArduPilot.
+_ROTATIONS = {0.0: 0, 90.0: 2, 180.0: 4, -90.0: 6}
+# Longest delay that ArduPilot takes, ms, and largest offset of a sensor, m.
+_LONGEST_DELAY, _FARTHEST = 250.0, 5.0
+# Tilt of a DVL, deg, from which on it does not look down. Chosen: halfway to the horizontal.
+_SIDEWAYS = 45.0
+_ELSEWHERE = "enter it in your navigation software"
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A line that is read by a vehicle or an instrument.
+
+    Parameters
+    ----------
+    text : str
+        The line.
+    grades : tuple of Grade
+        Of what it is made of: a red or grey one turns it into a comment.
+    """
+
+    text: str
+    grades: tuple[Grade, ...]
+
+
+# Settings, and remarks as plain text.
+Lines = Iterator[Setting | str]
+
+
+def settings_text(calibration: Calibration | Solution, target: str) -> str:
+    """Return a calibration as the settings of a vehicle or an instrument.
+
+    Parameters
+    ----------
+    calibration : Calibration or Solution
+        Calibration of a DVL.
+    target : str
+        One of `TARGETS`.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such target.
+    DataError
+        If it has no misalignment, scale error or lever arm.
+    """
+    if target not in TARGETS:
+        raise ConfigError(f"there is no target `{target}`", expected=", ".join(TARGETS))
+    write, _ = TARGETS[target]
+    i = instrument_of(calibration)
+    is_xml = target == "urdf"
+    out = []
+    for line in write(i, _delay(calibration)):
+        if isinstance(line, str):
+            out.append(_comment(line, is_xml=is_xml))
+            continue
+        why = [_REFUSED[grade] for grade in ("red", "grey") if grade in line.grades]
+        out.append(_comment(f"{line.text} ({why[0]})", is_xml=is_xml) if why else line.text)
+    return "\n".join(out) + "\n"
+
+
+def _comment(text: str, *, is_xml: bool) -> str:
+    # Two hyphens end a comment of XML.
+    return f"<!-- {text.replace('--', '- -')} -->" if is_xml else f"# {text}"
+
+
+def _delay(calibration: Calibration | Solution) -> tuple[float, Grade] | None:
+    """Return by how much stamps of the DVL are late, s, with the grade; None if held fixed."""
+    for estimate in calibration.estimates:
+        if estimate.name == TIME_OFFSET:
+            return float(estimate.value[0]), calibration.grades[TIME_OFFSET][0]
+    return None
+
+
+def transform(i: InstrumentTerms) -> tuple[Array, Array]:
+    """Return position (3,), m, and roll, pitch, yaw (3,), rad, of the DVL in forward, port, up.
+
+    With these axes for both, R = Rz(yaw) Ry(pitch) Rx(roll) takes components of the DVL to those
+    of the vehicle (REP 103).
+    """
+    angles = Rotation.from_matrix(_FLU @ _matrix(i) @ _FLU).as_euler("ZYX")[::-1]
+    return _FLU @ i.lever_arm, angles
+
+
+def _matrix(i: InstrumentTerms) -> Array:
+    """Return C_d^b in forward, starboard, down."""
+    angles = i.dvl_in_body["ZYX"].value[::-1]
+    return Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+
+
+def _looks_down(i: InstrumentTerms) -> bool:
+    return bool(_matrix(i)[2, 2] > np.cos(_SIDEWAYS * DEG))
+
+
+def _frames(i: InstrumentTerms) -> tuple[str, str]:
+    parent = "gnss" if i.origin == ANTENNA else i.origin.lower()
+    return f"{parent}_link", "dvl_link"
+
+
+def _grades(i: InstrumentTerms) -> tuple[Grade, ...]:
+    return (*i.dvl_in_body["ZYX"].grade, *i.lever_arm_grade)
+
+
+def _about_frames(i: InstrumentTerms) -> Lines:
+    parent, child = _frames(i)
+    yield f"From {parent}, the {i.origin}, to {child}; axes forward, port, up (REP 103)."
+    yield "roll, pitch, yaw about fixed axes x, y, z, rad; positive by the right hand."
+    yield f"Scale error {_percent(i)} %: no part of a transform, {_ELSEWHERE}."
+
+
+def _percent(i: InstrumentTerms) -> str:
+    return ", ".join(fixed(100.0 * float(value), 3) for value in i.scale_error)
+
+
+def _urdf(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
+    """URDF, element `origin` of a joint: xyz m, rpy rad about fixed axes, parent to child."""
+    yield from _about_frames(i)
+    (parent, child), (arm, angles) = _frames(i), transform(i)
+    xyz, rpy = (" ".join(fixed(float(x), n) for x in v) for v, n in ((arm, 4), (angles, 6)))
+    yield Setting(
+        f'<joint name="{child.removesuffix("_link")}_joint" type="fixed"><parent link="{parent}"/>'
+        f'<child link="{child}"/><origin xyz="{xyz}" rpy="{rpy}"/></joint>',
+        _grades(i),
+    )
+
+
+def _tf(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
+    """tf2_ros, `static_transform_publisher`: the pose of the child in the parent."""
+    yield from _about_frames(i)
+    (parent, child), (arm, angles) = _frames(i), transform(i)
+    named = [
+        *zip(("x", "y", "z"), (fixed(float(x), 4) for x in arm), strict=True),
+        *zip(("roll", "pitch", "yaw"), (fixed(float(x), 6) for x in angles), strict=True),
+        *(("frame-id", parent), ("child-frame-id", child)),
+    ]
+    arguments = " ".join(f"--{name} {value}" for name, value in named)
+    yield Setting(f"ros2 run tf2_ros static_transform_publisher {arguments}", _grades(i))
+
+
+def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
+    """ArduPilot, parameters of the library AP_VisualOdom.
+
+    VISO_POS: of the sensor from the origin of the body, forward, right, down. VISO_ORIENT: the
+    rotation that takes the sensor's vectors to the body. VISO_SCALE: positions are multiplied by
+    it. VISO_DELAY_MS: by how much the sensor is late.
+    """
+    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
+    yield "ArduPilot. VISO_POS from the IMU of the autopilot, forward, right, down, m."
+    if i.origin != "IMU":
+        yield f"The lever arm starts at the {i.origin}: add the place of that from the IMU."
+    for name, value, grade in zip("XYZ", i.lever_arm, i.lever_arm_grade, strict=True):
+        far = f"VISO_POS_{name} is limited to ± {_FARTHEST:g} m"
+        if abs(value) > _FARTHEST:
+            yield f"{far}, and is {fixed(float(value), 3)}: {_ELSEWHERE}"
+        else:
+            yield Setting(f"VISO_POS_{name},{fixed(float(value), 3)}", (grade,))
+    if not _looks_down(i):
+        yield f"VISO_ORIENT: none for a DVL that does not look down: {_ELSEWHERE}"
+    else:
+        nearest = min(_ROTATIONS, key=lambda angle: abs((yaw - angle + 180.0) % 360.0 - 180.0))
+        rest = (yaw - nearest + 180.0) % 360.0 - 180.0
+        yield Setting(f"VISO_ORIENT,{_ROTATIONS[nearest]}", (i.dvl_in_body["ZYX"].grade[2],))
+        yield (
+            f"VISO_ORIENT turns by 90 deg only. The rest is yaw {fixed(rest, 2)}, pitch "
+            f"{fixed(pitch, 2)}, roll {fixed(roll, 2)} deg: {_ELSEWHERE}, or in the program "
+            "that sends the messages"
+        )
+    yield "VISO_SCALE multiplies positions. Movements (VISION_POSITION_DELTA) are not scaled."
+    scale = 1.0 / (1.0 + float(np.mean(i.scale_error)))
+    yield Setting(f"VISO_SCALE,{fixed(scale, 5)}", tuple(i.scale_grade))
+    if delay is None:
+        yield "VISO_DELAY_MS: the time offset was not estimated"
+    elif not 0.0 <= 1e3 * delay[0] <= _LONGEST_DELAY:
+        yield f"VISO_DELAY_MS is 0 to {_LONGEST_DELAY:g}: {fixed(1e3 * delay[0], 0)} is not"
+    else:
+        yield Setting(f"VISO_DELAY_MS,{round(1e3 * delay[0])}", (delay[1],))
+
+
+def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
+    """Water Linked, DVL protocol: `mounting_rotation_offset`, whole degrees, clockwise.
+
+    It is the direction of the DVL's forward axis seen from that of the vehicle.
+    """
+    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
+    if not _looks_down(i):
+        yield f"mounting_rotation_offset: none for a DVL that does not look down: {_ELSEWHERE}"
+    else:
+        offset = round(yaw) % 360
+        rest = (yaw - offset + 180.0) % 360.0 - 180.0
+        parameters = {"mounting_rotation_offset": offset}
+        command = {"command": "set_config", "parameters": parameters}
+        yield "Send this line to port 16171 of the DVL. Positive: clockwise from above."
+        yield "It is valid if the offset was 0 in the trial."
+        yield Setting(json.dumps(command), (i.dvl_in_body["ZYX"].grade[2],))
+        yield f"The rest of yaw, {fixed(rest, 2)} deg: {_ELSEWHERE}"
+    yield from _not_set("Water Linked", i, f"roll {fixed(roll, 2)}, pitch {fixed(pitch, 2)} deg")
+
+
+def _nucleus(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
+    """Nortek Nucleus, whose rotations (SETINST) have no documented signs."""
+    roll, pitch, yaw = (fixed(float(x), 2) for x in i.dvl_in_body["ZYX"].value)
+    yield (
+        "SETINST has ROTXY, ROTYZ and ROTXZ. No public document states their signs: not written."
+    )
+    yield from _not_set("Nucleus", i, f"roll {roll}, pitch {pitch}, yaw {yaw} deg")
+
+
+def _not_set(maker: str, i: InstrumentTerms, angles: str) -> Lines:
+    yield from mount_in_words(i.axes)
+    arm = ", ".join(fixed(float(x), 3) for x in i.lever_arm)
+    yield f"{maker} has no setting for what follows: {_ELSEWHERE}."
+    yield f"- mounting angles: {angles} (starboard down, bow up, clockwise: positive)"
+    yield f"- scale error: {_percent(i)} % (positive: it reads too much)"
+    yield f"- lever arm or offset from the {i.origin}: {arm} m (forward, starboard, down)"
+
+
+# By name: what writes the settings, and the usual ending of their file.
+TARGETS: dict[str, tuple[Callable[[InstrumentTerms, tuple[float, Grade] | None], Lines], str]] = {
+    "urdf": (_urdf, "urdf"),
+    "tf": (_tf, "sh"),
+    "ardupilot": (_ardupilot, "param"),
+    "water-linked": (_water_linked, "txt"),
+    "nucleus": (_nucleus, "txt"),
+}

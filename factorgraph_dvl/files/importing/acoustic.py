@@ -1,0 +1,136 @@
+"""Fixes of a vehicle under water: its place relative to a vessel, whose position is known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from factorgraph_dvl.files.formats.format import KINDS, empty
+from factorgraph_dvl.files.formats.framing import Records
+from factorgraph_dvl.files.importing.decisions import Decisions
+from factorgraph_dvl.files.importing.merging import Beside, Merged, merge
+from factorgraph_dvl.files.importing.positions import STD_BY_QUALITY, UNKNOWN_STD
+from factorgraph_dvl.files.importing.spool import Spool, Stream
+from factorgraph_dvl.files.importing.time_base import Timed
+from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.vectors import Array
+
+# Chosen: of a true heading by GNSS or a gyrocompass that states none.
+_HEADING_STD = 1.0 * DEG
+# Chosen: time between records of the vessel, s, beyond which it is not known where it was.
+_LONGEST_STEP = 5.0
+
+
+def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> list[Timed]:
+    """Replace places relative to a vessel by fixes.
+
+    p = p_vessel + Rz(heading) place. The variance of a fix is that of the place, plus that of the
+    vessel's position, plus that of its heading times the squared distance.
+
+    Parameters
+    ----------
+    streams : sequence of Timed
+        Of all kinds.
+    spool : Spool
+        Takes the fixes.
+    decisions : Decisions
+        Takes what was done.
+
+    Returns
+    -------
+    list of Timed
+        Without the kinds `acoustic` and `topside`, whose motion is not that of the vehicle.
+    """
+    others = [t for t in streams if t.stream.kind not in ("acoustic", "topside")]
+    places = merge([t for t in streams if t.stream.kind == "acoustic"], decisions)
+    if places is None:
+        return others
+    position = _fullest(streams, "lat", decisions)
+    heading = _fullest(streams, "heading", decisions)
+    if position is None or heading is None:
+        lack = "position" if position is None else "heading"
+        decisions.add(
+            places.label, f"no file has the {lack} of the vessel → relative places are not used"
+        )
+        return others
+    decisions.add(
+        places.label,
+        f"relative to the vessel, whose position is that of {position.label} and whose heading "
+        f"that of {heading.label} → fixes of the vehicle, heights below the surface",
+        "gnss.file",
+    )
+    first = places.streams[0].stream
+    times: list[Array] = []
+
+    def parts() -> Iterator[Records]:
+        for time, fixes in _fixes(places, Beside(position), Beside(heading)):
+            times.append(time)
+            yield fixes
+
+    records = spool.store(parts(), KINDS["fix"])
+    stream = Stream(
+        first.file, first.format, "fix", "utc", first.stream, "", "unknown", (), records
+    )
+    return [*others, Timed.of(stream, times, spool)]
+
+
+def _fullest(streams: Sequence[Timed], name: str, decisions: Decisions) -> Merged | None:
+    """Return the records of the vessel with the most values of a field, None without."""
+    known = [
+        t
+        for t in streams
+        if t.stream.kind == "topside" and np.isfinite(t.stream.records[:1000][name]).any()
+    ]
+    if not known:
+        return None
+    return merge([max(known, key=lambda t: t.known)], decisions)
+
+
+def _fixes(places: Merged, position: Beside, heading: Beside) -> Iterator[tuple[Array, Records]]:
+    for time, part in places.chunks():
+        out = empty("fix", len(part))
+        for name in ("at", "received"):
+            out[name] = part[name]
+        out["time"] = time
+        vessel_time, vessel = position.around(time)
+        lat, lon = (_between(time, vessel_time, vessel[name]) for name in ("lat", "lon"))
+        heading_time, headings = heading.around(time)
+        known = np.isfinite(headings["heading"])
+        psi = _between(time, heading_time[known], np.unwrap(headings["heading"][known]))
+        forward, starboard, down = part["place"].T
+        north = forward * np.cos(psi) - starboard * np.sin(psi)
+        east = forward * np.sin(psi) + starboard * np.cos(psi)
+        meridian, transverse = radii(lat)
+        out["lat"] = lat + north / meridian
+        out["lon"] = lon + east / (transverse * np.cos(lat))
+        out["altitude"] = -down
+        surface = _level(vessel_time, vessel["quality"], time)
+        own = np.where(np.isfinite(part["std"]), part["std"], UNKNOWN_STD)
+        swing = _HEADING_STD * np.hypot(forward, starboard)
+        horizontal = np.sqrt(own**2 + surface**2 + swing**2)
+        out["std"] = np.stack([horizontal, horizontal, own], axis=1)
+        yield time, out
+
+
+def _between(time: Array, known: Array, values: Array) -> Array:
+    """Return values at times, linear between records that are not far apart, else nan."""
+    use = np.isfinite(values)
+    known, values = known[use], values[use]
+    if len(known) < 2:
+        return np.full(len(time), np.nan)
+    place = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
+    inside = (time >= known[0]) & (time <= known[-1])
+    near = inside & (known[place] - known[place - 1] < _LONGEST_STEP)
+    return np.where(near, np.interp(time, known, values), np.nan)
+
+
+def _level(known: Array, quality: Array, time: Array) -> Array:
+    """Return the standard deviation of the vessel's position at times, m, by its quality."""
+    level = np.full(len(quality), UNKNOWN_STD)
+    for value, std in STD_BY_QUALITY.items():
+        level[quality == value] = std
+    if not len(known):
+        return np.full(len(time), UNKNOWN_STD)
+    return level[np.clip(np.searchsorted(known, time), 0, len(known) - 1)]

@@ -1,0 +1,78 @@
+"""Places relative to a vessel become fixes of the vehicle."""
+
+from __future__ import annotations
+
+import format_samples as samples
+import numpy as np
+import pytest
+
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.importing.raw_files import import_files
+from factorgraph_dvl.files.tables import read_table
+from factorgraph_dvl.geometry.earth import radii
+
+DEG = np.pi / 180.0
+
+
+def imported(tmp_path, *names, **keys):
+    tables = samples.underwater_gps(**keys)
+    paths = []
+    for name in names:
+        paths.append(tmp_path / f"{name}.csv")
+        paths[-1].write_bytes(tables[name])
+    return import_files(paths, tmp_path / "trial"), tmp_path / "trial" / "gnss.parquet"
+
+
+def columns(path, *names):
+    table = read_table(path, names)
+    return [table[name] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("heading", "north", "east"), [(90.0, -5.0, 10.0), (0.0, 10.0, 5.0), (180.0, -10.0, -5.0)]
+)
+@pytest.mark.parametrize("sentences", [False, True])
+def test_a_place_by_hand(tmp_path, heading, north, east, sentences):
+    names = ("gga", "hdt") if sentences else ("position",)
+    decisions, gnss = imported(tmp_path, "acoustic", *names, heading=heading)
+    lat, lon, height = columns(gnss, "lat_deg", "lon_deg", "height_m")
+    meridian, transverse = radii(54.0 * DEG)
+    assert (lat[0] - 54.0) * DEG * meridian == pytest.approx(north, abs=1e-3)
+    place = (lon[0] + 3.0) * DEG * transverse * np.cos(54.0 * DEG)
+    assert place == pytest.approx(east, abs=1e-3)
+    np.testing.assert_allclose(height, -3.0)
+    # 1.5 m of the place, 2 cm of the vessel, and 1° at 11.2 m.
+    std = np.sqrt(1.5**2 + 0.02**2 + (np.hypot(10.0, 5.0) * DEG) ** 2)
+    east_std, up_std = columns(gnss, "std_e_m", "std_u_m")
+    np.testing.assert_allclose(east_std[0], std, rtol=1e-6)
+    np.testing.assert_allclose(up_std, 1.5)
+    account = {row[0]: row[1:] for row in decisions.accounts[0].rows()}
+    assert account["locator (acoustic)"] == (15, 5, "status")
+    assert account["row"] == (0, 20, "repeats another one")
+
+
+def test_positions_of_the_vessel_are_not_those_of_the_vehicle(tmp_path):
+    with pytest.raises(DataError, match="no data"):
+        imported(tmp_path, "orientation")
+    decisions, gnss = imported(tmp_path, "acoustic", "gga", "orientation")
+    assert not gnss.exists()
+    assert "no file has the heading of the vessel" in decisions.text("")
+    assert "orientation.csv: contains no data that a trial can use" in decisions.warnings
+
+
+def test_positions_without_an_orientation_are_those_of_the_vehicle(tmp_path):
+    _, gnss = imported(tmp_path, "global")
+    (lat,) = columns(gnss, "lat_deg")
+    np.testing.assert_allclose(lat, 54.00001)
+
+
+def test_the_vessel_is_not_known_in_a_gap(tmp_path):
+    tables = samples.underwater_gps(80)
+    lines = tables["position"].splitlines(keepends=True)
+    (tmp_path / "a.csv").write_bytes(tables["acoustic"])
+    (tmp_path / "b.csv").write_bytes(b"".join(lines[:20] + lines[60:]))
+    import_files([tmp_path / "a.csv", tmp_path / "b.csv"], tmp_path / "trial")
+    time, lat = columns(tmp_path / "trial" / "gnss.parquet", "time_s", "lat_deg")
+    inside = (time > 4.8) & (time < 14.7)
+    assert np.isnan(lat[inside]).all()
+    assert np.isfinite(lat[~inside]).all()

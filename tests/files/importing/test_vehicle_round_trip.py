@@ -1,0 +1,72 @@
+"""A simulated vehicle, written as its ground station logs it, and read back."""
+
+from __future__ import annotations
+
+import format_logs as logs
+import msgspec
+import numpy as np
+import pytest
+from truth import config
+
+from factorgraph_dvl.files.formats.clocks import utc_to_gps
+from factorgraph_dvl.files.importing.raw_files import import_files
+from factorgraph_dvl.files.trial_folder import load_trial
+from factorgraph_dvl.geometry.units import DAY, DEG
+from factorgraph_dvl.simulation import simulate
+
+START, BOOT, LATE = 1_700_000_000.0, 55.0, 0.03
+INTERVAL = 0.2
+
+
+def telemetry(trial):
+    """Return the log of a vehicle in axes forward, right, down, its messages in order."""
+    out = []
+    for time, (roll, pitch, heading) in zip(trial.attitude.time, trial.attitude.rph, strict=True):
+        ms = round((time + BOOT) * 1e3)
+        out.append((time, "ATTITUDE", (ms, roll, pitch, heading, 0.0, 0.0, 0.0), (1, 1)))
+    gnss = trial.gnss
+    for time, (lat, lon, height), std in zip(
+        gnss.time, gnss.geodetic, gnss.position_std, strict=True
+    ):
+        week, second = divmod(float(utc_to_gps(time + START)) - 315964800.0, 7.0 * DAY)
+        place = (round(lat / DEG * 1e7), round(lon / DEG * 1e7), height)
+        rest = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, std[0], std[2])
+        given = (0, round(second * 1e3), *place, *rest, 56, round(week), 0, 3, 10)
+        out.append((time, "GPS_INPUT", given, (1, 220)))
+    for time, velocity in zip(trial.dvl.time, trial.dvl.velocity, strict=True):
+        us = round((time + 0.5 * INTERVAL + BOOT) * 1e6)
+        delta = (us, round(INTERVAL * 1e6), 0, 0, 0, *(velocity * INTERVAL), 90.0)
+        out.append((time + 0.5 * INTERVAL, "VISION_POSITION_DELTA", delta, (1, 191)))
+    rng = np.random.default_rng(5)
+    return b"".join(
+        logs.telemetry(name, START + time + LATE * (1.0 + rng.exponential()), *values, sender=by)
+        for time, name, values, by in sorted(out, key=lambda x: x[0])
+    )
+
+
+def test_a_vehicle_comes_back_from_its_telemetry(tmp_path):
+    pytest.importorskip("pymavlink")
+    scenario = config("ship")
+    manoeuvres = scenario.manoeuvres[0]["manoeuvres"][:2]
+    trial = simulate(msgspec.structs.replace(scenario, manoeuvres=manoeuvres), 1)
+    assert trial.body_axes == "FRD"
+    (tmp_path / "a.tlog").write_bytes(telemetry(trial))
+    import_files([tmp_path / "a.tlog"], tmp_path / "trial")
+    found = load_trial(tmp_path / "trial")
+    assert (found.imu, found.body_axes) == (None, "FRD")
+    # One shift for all that the vehicle stamps: of how much later than at once things arrive.
+    epoch = np.datetime64(found.epoch.removesuffix("Z"), "s").astype(float) - START
+    pings = trial.dvl.time
+    assert len(found.dvl.time) == len(pings)
+    shift = found.dvl.time + epoch - pings
+    assert np.ptp(shift) < 2e-6
+    assert abs(shift[0]) < 0.05
+    np.testing.assert_allclose(
+        found.attitude.time + epoch - shift[0], trial.attitude.time, atol=1e-3
+    )
+    np.testing.assert_allclose(found.gnss.time + epoch, trial.gnss.time, atol=1e-3)
+    np.testing.assert_allclose(found.dvl.velocity, trial.dvl.velocity, atol=1e-5)
+    turned = np.angle(np.exp(1j * (found.attitude.rph - trial.attitude.rph)))
+    np.testing.assert_allclose(turned, 0.0, atol=1e-6)
+    np.testing.assert_allclose(found.gnss.geodetic[:, :2], trial.gnss.geodetic[:, :2], atol=1e-9)
+    np.testing.assert_allclose(found.gnss.position_std, trial.gnss.position_std, rtol=1e-5)
