@@ -35,10 +35,10 @@ def mount_in_words(axes: Array) -> list[str]:
     if abs(down) < np.cos(45.0 * DEG):
         looks = f"The DVL is mounted sideways: its z axis points {direction(axes[2])}."
         return [looks, *(f"Its {_NAMES[k]} axis points {direction(axes[k])}." for k in (0, 1))]
-    way = "along" if down > 0.0 else "against"
+    way = "down" if down > 0.0 else "up"
     tilt = np.degrees(np.arccos(min(abs(down), 1.0)))
     off = "" if tilt < _ALIGNED else f", {fixed(float(tilt), 2)} deg off the vertical"
-    looks = f"The DVL looks down {way} its z axis{off}."
+    looks = f"The DVL looks down{off}; its z axis points {way}."
     return [looks, *(f"Its {_NAMES[k]} axis points {direction(axes[k])}." for k in (0, 1))]
 
 

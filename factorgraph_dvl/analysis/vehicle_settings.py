@@ -12,7 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms, instrument_of
+from factorgraph_dvl.analysis.instrument_terms import (
+    ANTENNA,
+    ORIGINS,
+    InstrumentTerms,
+    instrument_of,
+)
 from factorgraph_dvl.analysis.mount import mount_in_words
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.units import DEG
@@ -136,7 +141,7 @@ def _about_frames(i: InstrumentTerms) -> Lines:
     parent, child = _frames(i)
     yield f"From {parent}, the {i.origin}, to {child}; axes forward, port, up (REP 103)."
     yield "roll, pitch, yaw about fixed axes x, y, z, rad; positive by the right hand."
-    yield f"Scale error {_percent(i)} %: no part of a transform, {_ELSEWHERE}."
+    yield f"Scale error {_percent(i)} %: not part of a transform, {_ELSEWHERE}."
 
 
 def _percent(i: InstrumentTerms) -> str:
@@ -177,14 +182,7 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
     """
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     yield "ArduPilot. VISO_POS from the IMU of the autopilot, forward, right, down, m."
-    if i.origin != "IMU":
-        yield f"The lever arm starts at the {i.origin}: add the place of that from the IMU."
-    for name, value, grade in zip("XYZ", i.lever_arm, i.lever_arm_grade, strict=True):
-        far = f"VISO_POS_{name} is limited to ± {_FARTHEST:g} m"
-        if abs(value) > _FARTHEST:
-            yield f"{far}, and is {fixed(float(value), 3)}: {_ELSEWHERE}"
-        else:
-            yield Setting(f"VISO_POS_{name},{fixed(float(value), 3)}", (grade,))
+    yield from _viso_position(i)
     if not _looks_down(i):
         yield f"VISO_ORIENT: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
@@ -205,6 +203,20 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
         yield f"VISO_DELAY_MS is 0 to {_LONGEST_DELAY:g}: {fixed(1e3 * delay[0], 0)} is not"
     else:
         yield Setting(f"VISO_DELAY_MS,{round(1e3 * delay[0])}", (delay[1],))
+
+
+def _viso_position(i: InstrumentTerms) -> Lines:
+    if i.origin != ORIGINS["imu"]:
+        arm = ", ".join(fixed(float(x), 3) for x in i.lever_arm)
+        yield f"VISO_POS: the lever arm is {arm} m from the {i.origin}, not from the IMU."
+        yield f"Enter VISO_POS_X, _Y and _Z after adding the place of the {i.origin} from the IMU."
+        return
+    for name, value, grade in zip("XYZ", i.lever_arm, i.lever_arm_grade, strict=True):
+        far = f"VISO_POS_{name} is limited to ± {_FARTHEST:g} m"
+        if abs(value) > _FARTHEST:
+            yield f"{far}, and is {fixed(float(value), 3)}: {_ELSEWHERE}"
+        else:
+            yield Setting(f"VISO_POS_{name},{fixed(float(value), 3)}", (grade,))
 
 
 def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from factorgraph_dvl.cli.console import print_file, warn
-from factorgraph_dvl.cli.options import Force, Target
+from factorgraph_dvl.cli.options import Anyway, Force, Target
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,6 +59,7 @@ def export(
         ),
     ] = None,
     force: Force = False,
+    anyway: Anyway = False,
 ) -> None:
     """Export the trajectory or the calibration of a solution, or the records of a trial.
 
@@ -85,18 +86,20 @@ def export(
         print_file(written)
         return
     if to.value in _SETTINGS:
-        _export_settings(folder, to.value, out, force=force)
+        _export_settings(folder, to.value, out, force=force, anyway=anyway)
         return
     _export_solution(folder, to, out, force=force)
 
 
-def _export_settings(folder: Path, to: str, out: Path | None, *, force: bool) -> None:
+def _export_settings(
+    folder: Path, to: str, out: Path | None, *, force: bool, anyway: bool
+) -> None:
     from factorgraph_dvl.analysis.vehicle_settings import TARGETS, settings_text
     from factorgraph_dvl.files.calibration_file import check_usable, load_calibration
     from factorgraph_dvl.files.folders import check_new_file, write_file
 
     found = load_calibration(folder)
-    check_usable(found, found.body_axes, str(folder))
+    check_usable(found, found.body_axes, str(folder), anyway=anyway)
     file = out or folder / f"dvl-{to}.{TARGETS[to][1]}"
     # What lies in the folder under these names was exported before.
     force = force or out is None

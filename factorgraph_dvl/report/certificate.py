@@ -27,7 +27,7 @@ def statements(result: Result) -> Iterator[tuple[tuple[str, ...], str]]:
     yield ("method",), method
     version = result.run.get("versions", {}).get("factorgraph-dvl", "")
     yield ("software",), f"factorgraph-dvl {version}".strip()
-    yield ("Verdict",), solution.verdict.grade
+    yield ("verdict",), solution.verdict.grade
 
 
 def _stated(

@@ -29,6 +29,12 @@ STYLES = {"error": "red", "warning": "yellow", "note": "", "ok": "green"}
 # Of verdicts and grades.
 VERDICT_COLOURS = {"good": "green", "doubtful": "yellow", "do not use": "red"}
 GRADES = {"green": "green", "orange": "yellow", "red": "red", "grey": "dim"}
+# What the table of the calibration is, where it has a misalignment.
+FOR_EXPERTS = (
+    "For experts: this table has the numbers of calibration.json. The misalignment is the "
+    "rotation vector from body to DVL, and vectors are in the body axes of the trial. "
+    "Do not enter them."
+)
 
 
 def calibration_table(

@@ -252,7 +252,8 @@ def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) 
         for name in re.findall(r"`(\w+)`", reason):
             if _find(root, (*path, name)):
                 path = (*path, name)
-        return ConfigError(f"{_dotted(path)}: {reason}", where=where(path))
+        what = f"{_dotted(path)}: {reason}" if path else reason
+        return ConfigError(what, where=where(path))
     found = value
     for key in path:
         found = found[key]

@@ -17,25 +17,25 @@ def turned(order, angles):
 @pytest.mark.parametrize(
     ("axes", "expected"),
     [
-        (np.eye(3), ["looks down along its z axis.", "x axis points to the bow", "to starboard"]),
+        (np.eye(3), ["looks down; its z axis points down.", "x axis points to the bow", "to starboard"]),
         (
             turned("Z", [3.7]),
-            ["along", "3.70 deg to starboard of the bow", "3.70 deg towards the stern from starb"],
+            ["axis points down", "3.70 deg to starboard of the bow", "3.70 deg towards the stern from starb"],
         ),
         (
             turned("Z", [-3.7]),
-            ["along", "3.70 deg to port of the bow", "3.70 deg towards the bow from starboard"],
+            ["axis points down", "3.70 deg to port of the bow", "3.70 deg towards the bow from starboard"],
         ),
         # Turned over about the bow: y to port, z up. Yaw is applied to the whole.
         (
             turned("ZYX", [3.3, 0.0, 180.0]),
-            ["looks down against its z axis.", "3.30 deg to starboard of the bow", "from port"],
+            ["looks down; its z axis points up.", "3.30 deg to starboard of the bow", "from port"],
         ),
-        (turned("Z", [175.0]), ["along", "5.00 deg to starboard of the stern", "port"]),
+        (turned("Z", [175.0]), ["axis points down", "5.00 deg to starboard of the stern", "port"]),
         # A bow that is raised by 10 deg.
         (
             turned("Y", [10.0]),
-            ["z axis, 10.00 deg off", "to the bow, 10.00 deg above the horizontal", "starboard"],
+            ["down, 10.00 deg off the vertical; its z axis points down.", "to the bow, 10.00 deg above the horizontal", "starboard"],
         ),
         # Rolled by 90 deg to starboard: y points down, z to port.
         (

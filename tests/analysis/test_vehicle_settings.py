@@ -130,6 +130,13 @@ def test_ardupilot_takes_what_it_has_room_for() -> None:
     assert "enter it in your navigation software" in sideways
 
 
+def test_ardupilot_gets_no_position_from_another_point_than_the_imu() -> None:
+    without = replace(known(ALPHAS[0]), inputs=("gnss: 1", "dvl: 2"))
+    text = settings_text(without, "ardupilot")
+    assert not [name for name in settings(text) if name.startswith("VISO_POS")]
+    assert "2.000, 1.000, -3.000 m from the GNSS antenna, not from the IMU" in text
+
+
 @pytest.mark.parametrize("alpha", ALPHAS)
 def test_water_linked(alpha: np.ndarray) -> None:
     """Clockwise rotation of the DVL in the vehicle: what is ahead of the DVL is that far off."""

@@ -36,10 +36,10 @@ class Tally:
 
     @property
     def reasons(self) -> str:
-        """The reasons as text, with counts if there are several; empty if nothing was skipped."""
+        """The reasons as text, each with its count if there are several; empty if nothing was skipped."""
         if len(self.skipped) == 1:
             return next(iter(self.skipped))
-        return ", ".join(f"{count} {reason}" for reason, count in self.skipped.items())
+        return ", ".join(f"{reason}: {count}" for reason, count in self.skipped.items())
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@
       width: width(), height: plot.height, legend: { show: false }, bands, series,
       cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false } },
       scales: { x: { time: false }, y: plot.log ? { distr: 3, range: (u, min, max) => [min / 1.3, max * 1.3] } : plot.limit === null ? {} : { range: [-plot.limit * 1.08, plot.limit * 1.08] } },
-      axes: [{ size: 34, space: 60, label: label("time, s", "时间，s"), labelSize: 20, labelFont: font, font }, { size: 60, label: label(plot.label, plot.label_zh), labelSize: 20, labelFont: font, font, values: (_, ticks) => ticks.map(short), ...(plot.log ? { splits: decades, filter: (_, ticks) => ticks } : {}) }],
+      axes: [{ size: 34, space: 60, label: label("time, s", "时间，s"), labelSize: 20, labelFont: font, font }, { size: 72, label: label(plot.label, plot.label_zh), labelSize: 20, labelFont: font, font, values: (_, ticks) => ticks.map(short), ...(plot.log ? { splits: decades, filter: (_, ticks) => ticks } : {}) }],
       hooks: {
         drawClear: [(u) => {
           for (const [from, to, label] of plot.shade) {

@@ -41,7 +41,7 @@ from factorgraph_dvl.report.html.markup import (
 from factorgraph_dvl.report.html.plots import Plot
 from factorgraph_dvl.report.html.steps import steps_drawing
 from factorgraph_dvl.report.html.track import track_svg
-from factorgraph_dvl.report.tables import calibration_table, posterior_table
+from factorgraph_dvl.report.tables import FOR_EXPERTS, calibration_table, posterior_table
 from factorgraph_dvl.solution import Solution
 
 # Class of each verdict in the style sheet.
@@ -61,13 +61,6 @@ _MANOEUVRES = {
     "turns": "turns to both sides at 3 deg/s",
     "pitching": "pitching by 10 deg, up and down",
 }
-
-
-_FOR_EXPERTS = (
-    "For experts: this table has the numbers of calibration.json. The misalignment is the "
-    "rotation vector from body to DVL, and vectors are in the body axes of the trial. "
-    "Do not enter them."
-)
 
 
 def verdict_section(result: Result) -> Section:
@@ -145,7 +138,7 @@ def calibration_section(result: Result) -> Section:
             "that; grey, the data did not halve the σ known before the trial."
         )),
         *(
-            [paragraph(both(_FOR_EXPERTS))] if has_instrument_terms(solution) else []
+            [paragraph(both(FOR_EXPERTS))] if has_instrument_terms(solution) else []
         ),
         described(calibration_table(solution, known), label="Calibration"),
         *_noise(solution),

@@ -13,7 +13,7 @@ from factorgraph_dvl.report.html.markup import Html, labels, round_step, tspans
 
 # Size of the drawing and its margins, in its own units.
 _SIZE = 720.0
-_MARGIN = 60.0
+_MARGIN = 90.0
 # Points of the track closer than this, in the drawing's units, are one. Chosen: half a line.
 _APART = 0.8
 # About as many lines of the grid to each side, and marks of time on the track.

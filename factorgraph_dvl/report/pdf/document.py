@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
 
 from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
@@ -23,7 +24,7 @@ from factorgraph_dvl.report.figures.vessel import draw_vessel
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.pdf.sheet import SMALL, TEXT, Sheet, fonts
 from factorgraph_dvl.report.table import Component, Table, plain
-from factorgraph_dvl.report.tables import calibration_table
+from factorgraph_dvl.report.tables import FOR_EXPERTS, calibration_table
 from factorgraph_dvl.report.vessel import AXES, LEGEND, VIEWS, axes_of, places_of
 from factorgraph_dvl.solution import Solution
 
@@ -89,20 +90,36 @@ def _first_page(sheet: Sheet, result: Result) -> None:
         _table(sheet, entries_table(terms, result.maker))
         sheet.text(" ".join(map(sheet.said, conventions(terms))), SMALL)
         places = places_of(terms, solution, result.run.get("settings", {}))
-        titles = list(VIEWS)
         sheet.space(0.25)
-        for ax, title in zip(
-            sheet.axes(min(3.0, sheet.left - 0.9), 2, labels=0.4), titles, strict=True
-        ):
-            draw_vessel(ax, VIEWS[title], places, axes_of(terms), sheet.said)
+        drawings = sheet.axes(min(3.0, sheet.left - 0.9), 2, labels=0.55)
+        for ax, (title, view) in zip(drawings, VIEWS.items(), strict=True):
+            draw_vessel(ax, view, places, axes_of(terms), sheet.said)
             ax.set_title(sheet.said(title), fontsize=TEXT, loc="left")
-            ax.set_xlabel(sheet.said("starboard" if "above" in title else "forward") + ", m",
-                          fontsize=SMALL)  # fmt: skip
+            for axis, seen in zip((ax.xaxis, ax.yaxis), view, strict=True):
+                _name_axis(axis, seen, sheet)
         sheet.space(0.5)
         legend = (f"Reference point: {terms.origin}.", *LEGEND)
         sheet.text(" ".join(map(sheet.said, legend)), SMALL)
     else:
         _table(sheet, calibration_table(solution).brief())
+
+
+def _name_axis(axis: Axis, seen: Array, sheet: Sheet) -> None:
+    """Name an axis of a drawing, with the signs of the lever arm.
+
+    Parameters
+    ----------
+    axis : Axis
+        Axis of the drawing.
+    seen : ndarray, shape (3,)
+        What is seen along it, of forward, starboard, down.
+    sheet : Sheet
+        Page of the drawing.
+    """
+    along = int(np.argmax(np.abs(seen)))
+    sign = float(seen[along])
+    axis.set_label_text(f"{sheet.said(AXES[along])}, m", fontsize=SMALL)
+    axis.set_major_formatter(lambda at, _: f"{sign * at + 0.0:.3g}".replace("-", "−"))
 
 
 def _second_page(sheet: Sheet, result: Result) -> None:
@@ -126,7 +143,7 @@ def _check_plots(sheet: Sheet, result: Result) -> None:
     columns = result.check_table
     time = columns["time_s"] - result.start
     label = sheet.said("time, s")
-    sheet.space(0.1)
+    sheet.space(0.25)
     for ax, when in zip(sheet.axes(1.35, 2), ("before", "after"), strict=True):
         for axis, colour in zip(AXES, _COLOURS, strict=True):
             values = columns[f"residual_{axis}_{when}_m_s"]
@@ -139,7 +156,7 @@ def _check_plots(sheet: Sheet, result: Result) -> None:
         if when == "after":
             ax.legend(fontsize=SMALL, ncols=3, frameon=False, loc="lower right",
                       handlelength=0.8, columnspacing=0.8,
-                      bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)  # fmt: skip
+                      bbox_to_anchor=(1.0, 1.14), borderaxespad=0.0)  # fmt: skip
     sheet.space(0.65)
     if np.isfinite(columns.get("track_error_after_m", np.nan)).any():
         (ax,) = sheet.axes(1.35)
@@ -185,6 +202,8 @@ def _third_page(sheet: Sheet, result: Result) -> None:
     sheet.space(0.2)
     if result.solution.estimates:
         sheet.heading("Calibration", TEXT + 1.0)
+        if has_instrument_terms(result.solution):
+            sheet.text(sheet.said(FOR_EXPERTS), SMALL)
         table = calibration_table(result.solution)
         fits = int((sheet.left - 0.5) / 0.16)
         kept = Table(columns=table.columns, rows=table.rows[: max(fits, 1)])

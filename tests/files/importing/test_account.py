@@ -114,7 +114,7 @@ def test_records_without_time_or_value(spool):
     store.append("f", "nucleus", batch)
     (tally,) = store.tallies("f").values()
     assert (tally.read, tally.skipped) == (2, {"no time": 1, "no value": 1})
-    assert tally.reasons == "1 no time, 1 no value"
+    assert tally.reasons == "no time: 1, no value: 1"
 
 
 def whole_files():
