@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from factorgraph_dvl.campaign.files import REPORT_FILE
+from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
+from factorgraph_dvl.campaign.files import REPORT_FILE, for_the_next
 from factorgraph_dvl.campaign.joint_calibration import JointCalibration
 from factorgraph_dvl.campaign.monte_carlo import MonteCarlo, Statistic
 from factorgraph_dvl.campaign.record import write_whole
@@ -19,7 +20,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.notation import at_precision, split_unit, with_std
 from factorgraph_dvl.quality.texts import chinese, component_names, text_of
+from factorgraph_dvl.report.entries import TITLE
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS
+from factorgraph_dvl.report.html.entries import values_to_enter
 from factorgraph_dvl.report.html.markup import (
     Cell,
     Html,
@@ -56,6 +59,10 @@ def write_page(campaign: Campaign, out: Path) -> None:
         sections.append(section("Not solved", own, key="failed"))
     joint = campaign.joint
     if joint is not None:
+        expected = for_the_next(campaign, joint)
+        if expected.verdict.grade != "do not use" and has_instrument_terms(expected):
+            own = values_to_enter(instrument_of(expected))
+            sections.append(section(TITLE, own, key="enter"))
         sections += _joint_sections(campaign, joint)
         text = "Each point is a trial with its σ, and leads to its result."
         panels: list[Cell] = [paragraph(both(text))]

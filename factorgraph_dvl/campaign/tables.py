@@ -24,7 +24,11 @@ def joint_table(campaign: Campaign, joint: JointCalibration) -> Table:
     """
     table = Table(
         title="Joint calibration",
-        caption="Grades are those of a next trial: its σ includes the variation between trials.",
+        caption=(
+            "Grades are those of a next trial: its σ includes the variation between trials. "
+            "The misalignment is a rotation vector, in the body axes of the trials: do not enter "
+            "it."
+        ),
     )
     table.column("parameter")
     table.column("value ± σ", numeric=True)

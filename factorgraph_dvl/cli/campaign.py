@@ -209,15 +209,18 @@ def _run(
 
 
 def _print_campaign(found: Campaign) -> None:
-    """Print the verdict of the whole, the joint calibration, changes, and trials by verdict."""
+    """Print the verdict of the whole, joint calibration, changes, trials, and what to enter."""
+    from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
     from factorgraph_dvl.campaign.files import for_the_next
     from factorgraph_dvl.campaign.tables import joint_table, trials_table
     from factorgraph_dvl.quality.notation import with_std
     from factorgraph_dvl.quality.texts import text_of
+    from factorgraph_dvl.report.entries import entries_table
 
     joint = found.joint
-    if joint is not None:
-        print_verdict(for_the_next(found, joint).verdict)
+    expected = None if joint is None else for_the_next(found, joint)
+    if expected is not None:
+        print_verdict(expected.verdict)
     for t in found.trials:
         if t.unused:
             warn(f"{t.label} is not used: {text_of(t.unused)}")
@@ -233,6 +236,12 @@ def _print_campaign(found: Campaign) -> None:
             )
             stdout().print(text, markup=False, soft_wrap=True)
     print_table(trials_table(found))
+    if (
+        expected is not None
+        and expected.verdict.grade != "do not use"
+        and has_instrument_terms(expected)
+    ):
+        print_table(entries_table(instrument_of(expected)), "unit")
 
 
 def _end(failed: int, count: int) -> None:

@@ -21,6 +21,15 @@ REFUSED = {
     "red": "σ is more than twice its limit",
     "grey": "the trial did not determine it",
 }
+# What must be checked before the names of a maker are used, by the first word of them.
+_AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
+_UNVERIFIED = "The maker's signs are not verified against its manual: check one before use."
+_REMARKS = {
+    "TRDI": (_AT_ZERO, "The sign of EA is not verified against a manual: check it before use."),
+    "Nortek": (_UNVERIFIED,),
+    "Water": (_AT_ZERO,),
+    "Delph": (_UNVERIFIED,),
+}
 # Chosen: a DVL that looks down has a smaller roll and pitch.
 _LOOKS_UP_DEG = 90.0
 
@@ -93,7 +102,7 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
     maker : str, optional
         Maker of the DVL; where it is known, the table has the maker's own names too.
     """
-    table = Table(title=TITLE, caption=" ".join(conventions(i)))
+    table = Table(title=TITLE, caption=" ".join(conventions(i, maker)))
     table.column("quantity")
     table.column("value ± σ", numeric=True)
     table.column("unit")
@@ -105,18 +114,31 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
             end_section=e is entries[-1],
         )  # fmt: skip
     graded = {e.key: e.grade for e in entries}
-    for name, text, unit, of in maker_rows(i, maker):
+    for name, text, unit, rule, of in maker_rows(i, maker):
         grade = worst(graded[key] for key in graded if key.startswith(tuple(of)))
-        table.row(name, text, unit, "", Mark(grade, GRADES[grade]))
+        table.row(name, text, unit, rule, Mark(grade, GRADES[grade]))
     return table
 
 
-def conventions(i: InstrumentTerms) -> tuple[str, str, str]:
-    """Return how angles and lever arm are defined, and which values must not be entered."""
+def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
+    """Return how angles and lever arm are defined, and which values must not be entered.
+
+    Parameters
+    ----------
+    i : InstrumentTerms
+        Calibration in the terms of instruments.
+    maker : str, optional
+        Maker of the DVL: what must be checked before its own names are used comes last.
+    """
     return (
         "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
         "Do not enter red or grey values.",
         f"Lever arm: from the {i.origin} to the DVL.",
+        *dict.fromkeys(
+            remark
+            for name, *_ in maker_rows(i, maker)
+            for remark in _REMARKS.get(name.split()[0], ())
+        ),
     )
 
 
@@ -130,8 +152,8 @@ def sum_with_compass(findings: Iterable[Finding]) -> Finding | None:
     )
 
 
-def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequence[str]]]:
-    """Return what a maker calls the numbers: name, number, unit, and the entries they are from.
+def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str, Sequence[str]]]:
+    """Return what a maker calls the numbers: name, number, unit, sign rule, entries they are from.
 
     Parameters
     ----------
@@ -142,28 +164,31 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, Sequ
     """
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     angles = ("roll", "pitch", "yaw")
+    clockwise = "clockwise from above"
     known = maker.lower()
     if any(name in known for name in ("trdi", "rdi", "teledyne")) and not looks_up_for_trdi(i):
+        rules = (clockwise, "ship: port side up", "ship: bow up")
         return [
-            (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", angles)
-            for name, a in zip(("EA", "EI", "EJ"), i.alignment, strict=True)
+            (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", rule, angles)
+            for name, a, rule in zip(("EA", "EI", "EJ"), i.alignment, rules, strict=True)
         ]
     if "nortek" in known:
+        rules = ("starboard down", "bow up", "to starboard")
         return [
-            (f"Nortek {name}", fixed(a, 2), "deg", angles)
-            for name, a in zip(angles, (roll, pitch, yaw), strict=True)
+            (f"Nortek {name}", fixed(a, 2), "deg", rule, angles)
+            for name, a, rule in zip(angles, (roll, pitch, yaw), rules, strict=True)
         ]
     if any(name in known for name in ("water linked", "waterlinked")) and not looks_up(i):
         offset = f"{round(yaw) % 360}"
-        return [("Water Linked mounting_rotation_offset", offset, "deg", ("yaw",))]
+        return [("Water Linked mounting_rotation_offset", offset, "deg", clockwise, ("yaw",))]
     if any(name in known for name in ("exail", "ixblue", "delph")):
         forward, starboard, down = (float(x) for x in i.lever_arm)
-        arm = (("X1", forward), ("X2", -starboard), ("X3", -down))
+        arm = (("X1", forward, "ahead"), ("X2", -starboard, "to port"), ("X3", -down, "above"))
         return [
-            ("Delph heading", fixed(yaw, 2), "deg", angles),
-            ("Delph pitch", fixed(-pitch, 2), "deg", angles),
-            ("Delph roll", fixed(roll, 2), "deg", angles),
-            *((f"Delph {name}", fixed(x, 3), "m", ("lever_arm",)) for name, x in arm),
+            ("Delph heading", fixed(yaw, 2), "deg", clockwise, angles),
+            ("Delph pitch", fixed(-pitch, 2), "deg", "bow down", angles),
+            ("Delph roll", fixed(roll, 2), "deg", "port side up", angles),
+            *((f"Delph {name}", fixed(x, 3), "m", rule, ("lever_arm",)) for name, x, rule in arm),
         ]
     return []
 

@@ -17,14 +17,25 @@ def turned(order, angles):
 @pytest.mark.parametrize(
     ("axes", "expected"),
     [
-        (np.eye(3), ["looks down; its z axis points down.", "x axis points to the bow", "to starboard"]),
+        (
+            np.eye(3),
+            ["looks down; its z axis points down.", "x axis points to the bow", "to starboard"],
+        ),
         (
             turned("Z", [3.7]),
-            ["axis points down", "3.70 deg to starboard of the bow", "3.70 deg towards the stern from starb"],
+            [
+                "axis points down",
+                "3.70 deg to starboard of the bow",
+                "3.70 deg towards the stern from starb",
+            ],
         ),
         (
             turned("Z", [-3.7]),
-            ["axis points down", "3.70 deg to port of the bow", "3.70 deg towards the bow from starboard"],
+            [
+                "axis points down",
+                "3.70 deg to port of the bow",
+                "3.70 deg towards the bow from starboard",
+            ],
         ),
         # Turned over about the bow: y to port, z up. Yaw is applied to the whole.
         (
@@ -35,7 +46,11 @@ def turned(order, angles):
         # A bow that is raised by 10 deg.
         (
             turned("Y", [10.0]),
-            ["down, 10.00 deg off the vertical; its z axis points down.", "to the bow, 10.00 deg above the horizontal", "starboard"],
+            [
+                "down, 10.00 deg off the vertical; its z axis points down.",
+                "to the bow, 10.00 deg above the horizontal",
+                "starboard",
+            ],
         ),
         # Rolled by 90 deg to starboard: y points down, z to port.
         (

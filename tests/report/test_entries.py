@@ -19,7 +19,8 @@ from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.report.entries import entries_of, entries_table
+from factorgraph_dvl.quality.texts import chinese
+from factorgraph_dvl.report.entries import conventions, entries_of, entries_table
 from factorgraph_dvl.report.files.instrument import instrument_text
 from factorgraph_dvl.report.table import plain
 
@@ -175,6 +176,11 @@ def test_the_maker_s_own_names_are_in_the_table(maker: str, rows: dict[str, str]
     terms = instrument_of(calibration(alpha=np.array([0.0, 0.0, 10.0])))
     table = entries_table(terms, maker)
     assert {plain(row[0]): row[1] for row in table.rows[7:]} == rows
+    # Each has its sign rule, and the caption says what to check first.
+    assert all(plain(row[3]) for row in table.rows)
+    assert len(conventions(terms, maker)) == 3 + (2 if maker == "Teledyne RDI" else bool(rows))
+    for phrase in (*conventions(terms, maker), *(plain(row[3]) for row in table.rows)):
+        assert chinese(phrase) != phrase
 
 
 def test_a_result_without_a_dvl_has_nothing_to_enter() -> None:

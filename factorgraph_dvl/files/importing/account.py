@@ -36,7 +36,7 @@ class Tally:
 
     @property
     def reasons(self) -> str:
-        """The reasons as text, each with its count if there are several; empty if nothing was skipped."""
+        """The reasons as text, with counts if there are several; empty if nothing was skipped."""
         if len(self.skipped) == 1:
             return next(iter(self.skipped))
         return ", ".join(f"{reason}: {count}" for reason, count in self.skipped.items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from factorgraph_dvl.analysis.instrument_terms import instrument_of
+from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms, instrument_of
 from factorgraph_dvl.report.entries import TITLE, conventions, entries_table, sum_with_compass
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import Html, both, described, element, joined, paragraph
@@ -20,6 +20,13 @@ def entries_content(result: Result) -> Iterator[Html]:
     terms = instrument_of(result.solution)
     if (found := sum_with_compass(result.solution.findings)) is not None:
         yield paragraph(joined(both("Mount and compass:"), both(str(found), found.chinese)))
-    yield described(entries_table(terms, result.maker), label=TITLE)
-    yield paragraph(joined(*map(both, conventions(terms))))
+    yield values_to_enter(terms, result.maker)
     yield vessel_drawing(terms, result.solution, result.run.get("settings", {}))
+
+
+def values_to_enter(terms: InstrumentTerms, maker: str = "") -> Html:
+    """Return the table of what to enter, with its conventions."""
+    return joined(
+        described(entries_table(terms, maker), label=TITLE),
+        paragraph(joined(*map(both, conventions(terms, maker)))),
+    )

@@ -68,9 +68,10 @@ def _first_page(sheet: Sheet, result: Result) -> None:
     """Verdict, what to enter, and the drawing of the vessel."""
     solution = result.solution
     verdict = solution.verdict
-    sheet.text(f"{sheet.said('Calibration report')}: {result.trial}", 15.0, weight="bold")
+    colon = ": " if sheet.language == "en" else "："
+    sheet.text(f"{sheet.said('Calibration report')}{colon}{result.trial}", 15.0, weight="bold")
     colour = VERDICT_COLOURS[verdict.grade]
-    sheet.text(f"{sheet.said('Verdict')}: {sheet.said(verdict.grade)}", 13.0, colour=colour,
+    sheet.text(f"{sheet.said('Verdict')}{colon}{sheet.said(verdict.grade)}", 13.0, colour=colour,
                weight="bold")  # fmt: skip
     if not verdict.reasons:
         sheet.text(sheet.said("The checks found nothing wrong."))
@@ -88,7 +89,7 @@ def _first_page(sheet: Sheet, result: Result) -> None:
         if (found := sum_with_compass(solution.findings)) is not None:
             sheet.text(f"{sheet.said('Mount and compass:')} {_said(found, sheet.language)}", SMALL)
         _table(sheet, entries_table(terms, result.maker))
-        sheet.text(" ".join(map(sheet.said, conventions(terms))), SMALL)
+        sheet.text(" ".join(map(sheet.said, conventions(terms, result.maker))), SMALL)
         places = places_of(terms, solution, result.run.get("settings", {}))
         sheet.space(0.25)
         drawings = sheet.axes(min(3.0, sheet.left - 0.9), 2, labels=0.55)
