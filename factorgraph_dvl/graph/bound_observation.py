@@ -245,7 +245,7 @@ class BoundObservation:
         Parameters
         ----------
         lin : Linearization
-            Of all measurements.
+            Linearisation of all measurements.
         some : slice or ndarray of int
             Which of them.
         motion, states, parameters : Motion or object or mapping of str to ndarray

@@ -31,7 +31,7 @@ class StepRows:
     first : int
         First of the M steps.
     residual : ndarray, shape (M, d)
-        Of unit noise.
+        Residuals of unit noise.
     by_nodes : ndarray, shape (M, d, n)
         Derivatives by the variables of the nodes before and after, as `Chain.variables`.
     """
@@ -163,7 +163,7 @@ class Chain(Protocol):
         Parameters
         ----------
         states : object
-            Of the K nodes.
+            States of the K nodes.
         P : ndarray, shape (K, 9, 9)
             Their covariances, in GTSAM's tangent space.
         body_axes : BodyAxes
@@ -181,7 +181,7 @@ class Chain(Protocol):
         Parameters
         ----------
         letters : str
-            Of the factor's variables.
+            Letters of the factor's variables.
         """
 
     def assumed(self) -> dict[str, str]:
@@ -203,9 +203,9 @@ class Chain(Protocol):
         Parameters
         ----------
         time : ndarray, shape (M,), s
-            By the clock of the nodes.
+            Times by the clock of the nodes.
         shift : float, default 0, s
-            Of the clock of attitudes beside it.
+            Shift of the clock of attitudes beside it.
         turning : bool, default False
             Whether they hang between the nodes that their attitude is between, as measurements of
             attitude do, and those that move with the nodes.

@@ -82,7 +82,7 @@ def linearized(
     observation : Observation
         M measurements.
     motion : Motion
-        At the true times.
+        Motion at the true times.
     values : mapping of str to ndarray
         Values of the parameters, SI.
     wanted : collection of str

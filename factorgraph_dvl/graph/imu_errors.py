@@ -44,7 +44,7 @@ class LinearImuFactors:
     native : gtsam.GaussianFactorGraph
         All native factors as GTSAM linearises them, the S IMU factors first.
     jacobian : ndarray, shape (S, 9, 24 + n)
-        Of the IMU factors: states, bias, errors.
+        Jacobian of the IMU factors: states, bias, errors.
     rhs : ndarray, shape (S, 9)
         Right-hand side of the IMU factors.
     more_cost : float

@@ -336,7 +336,7 @@ class InertialChain:
         Parameters
         ----------
         states : States
-            Of the K nodes.
+            States of the K nodes.
         P : ndarray, shape (K, 9, 9)
             Their covariances, in GTSAM's tangent space.
         body_axes : BodyAxes

@@ -36,7 +36,7 @@ def node_jacobian(lin: Linearization, transition: Transition) -> Array:
     lin : Linearization
         Derivatives with respect to the motion at the M times.
     transition : Transition
-        From the nodes to these times.
+        Transition from the nodes to these times.
     """
     state, bias = _by_node(lin, transition)
     return np.concatenate([*state, *bias], axis=2)

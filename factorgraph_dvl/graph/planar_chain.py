@@ -42,7 +42,7 @@ class Recorded:
     Parameters
     ----------
     time : ndarray, shape (G,), s
-        Of the values.
+        Times of the values.
     heading : ndarray, shape (G,)
         Clockwise from north, unwrapped, rad.
     height, climb : ndarray, shape (G,)
@@ -77,7 +77,7 @@ class PlanarStates:
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the nodes.
+        Times of the nodes.
     x : ndarray, shape (K, 4)
         Position and velocity over ground, east and north, m, m/s.
     nRb : ndarray, shape (K, 3, 3)
@@ -119,7 +119,7 @@ class Between:
     Parameters
     ----------
     motion : Motion
-        At M times.
+        Motion at M times.
     by_nodes : ndarray, shape (M, 9, 8)
         Derivatives of attitude, position and velocity by the nodes before and after.
     """
@@ -137,7 +137,7 @@ class PlanarChain:
     frame : LocalFrame
         Tangent frame n.
     node_time : ndarray, shape (K,), s
-        Of the nodes.
+        Times of the nodes.
     density : ndarray, shape (K - 1, 2, 2), m²/s³
         Power spectral densities of the acceleration between nodes.
     recorded : Recorded
@@ -440,7 +440,7 @@ class PlanarChain:
         Parameters
         ----------
         states : PlanarStates
-            Of the K nodes.
+            States of the K nodes.
         P : ndarray, shape (K, 4, 4)
             Their covariances.
         body_axes : BodyAxes

@@ -107,7 +107,7 @@ class Tilt:
     Parameters
     ----------
     gradient : ndarray, shape (P,), 1/SI
-        In the tangent space at the origin.
+        Gradient in the tangent space at the origin.
     sigma : ndarray, shape (P,), SI
         Standard deviations of the parameters.
     origin : dict of str to ndarray

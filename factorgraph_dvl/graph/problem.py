@@ -419,9 +419,9 @@ class Problem:
         observation : Observation
             One of the problem's.
         motion : Motion
-            At the true times.
+            Motion at the true times.
         parameters : dict of str to ndarray
-            Of an evaluation.
+            Parameters of an evaluation.
         """
         (bound,) = (b for b in self._bound if b.observation is observation)
         return bound.residual(motion, parameters, self.processes_of(bound))

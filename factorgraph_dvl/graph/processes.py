@@ -42,7 +42,7 @@ class Process:
     label : str
         Label of the observation; what it is, where it adds to a parameter.
     index : int
-        Of the process among those of the problem.
+        Index of the process among those of the problem.
     sigma : ndarray, shape (n,), SI
         Standard deviation of each component.
     tau : ndarray, shape (n,), s
@@ -52,7 +52,7 @@ class Process:
     density_only : bool, default False
         Whether only the density 2 sigma² / tau can be estimated, and sigma is as stated.
     walk : ScaleWalk, optional
-        Of the scale, which is the last component of the nodes.
+        Random walk of the scale, which is the last component of the nodes.
     parameter : str, optional
         Name of the parameter that it adds to, for all observations that depend on it.
     free : bool, default False
@@ -80,7 +80,7 @@ class Process:
         time : ndarray, shape (J,), s
             Times of the nodes.
         walk : ScaleWalk, optional
-            Of the scale, with what is measured there.
+            Random walk of the scale, with what is measured there.
         """
         out = replace(self, time=time, walk=walk, goes_on=True)
         # A walk's go by the length of the whole record.
@@ -164,7 +164,7 @@ class Process:
         jacobian : ndarray, shape (M, d, n)
             Derivatives by the parameter.
         time : ndarray, shape (M,), s
-            Of the measurements.
+            Times of the measurements.
         """
         _, after = self.place(time)
         by_node = jacobian * self._of_nodes[0]

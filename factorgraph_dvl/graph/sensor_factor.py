@@ -204,9 +204,9 @@ class Linearized:
     Parameters
     ----------
     state, bias : gtsam.NavState or gtsam.imuBias.ConstantBias
-        Of the node.
+        State and bias of the node.
     values : mapping of str to ndarray
-        Of the parameters.
+        Values of the parameters.
     residual, jacobian : ndarray
         As `NodeMeasurements.linearize` returns them.
     """
@@ -248,7 +248,7 @@ def measurement_factor(
     weight : ndarray, shape (R,)
         Inverse standard deviations; 0 = not used.
     node_key, bias_key, parameter_keys : int or sequence of int
-        Of the variables, parameters as in `measured`.
+        Keys of the variables, parameters as in `measured`.
     first : Linearized, optional
         Where GTSAM will linearise first.
     errors : mapping of int to ndarray, optional

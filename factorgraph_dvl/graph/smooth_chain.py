@@ -66,7 +66,7 @@ class Attached:
     segment : ndarray of int, shape (M,)
         The same: segments are from node to node.
     time, turned : ndarray, shape (M,), s
-        By the clock of the nodes, and by that of their attitudes.
+        Times by the clock of the nodes, and by that of their attitudes.
     """
 
     node: IntArray
@@ -82,7 +82,7 @@ class ChainStates(SmoothStates):
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Of the nodes.
+        Times of the nodes.
     """
 
     time: Array
@@ -102,7 +102,7 @@ class SmoothChain:
     frame : LocalFrame
         Tangent frame n.
     node_time : ndarray, shape (K,), s
-        Of the nodes, by `clock`.
+        Times of the nodes, by `clock`.
     density : ndarray, shape (K - 1, 6)
         Power spectral densities of the acceleration between nodes, as of `motion_steps`.
     start : SmoothStates
@@ -371,7 +371,7 @@ class SmoothChain:
         Parameters
         ----------
         states : ChainStates
-            Of the K nodes.
+            States of the K nodes.
         P : ndarray, shape (K, 9, 9)
             Their covariances at true times, in GTSAM's tangent space.
         body_axes : BodyAxes

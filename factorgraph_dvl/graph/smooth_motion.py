@@ -128,9 +128,9 @@ def motion_steps(turns: Turns, states: SmoothStates, nRt: Array, density: Array)
     Parameters
     ----------
     turns : Turns
-        Of the states.
+        Turns of the states.
     states : SmoothStates
-        At the nodes.
+        States at the nodes.
     nRt : ndarray, shape (K, 3, 3)
         Axes of the track to n.
     density : ndarray, shape (K - 1, 6)
@@ -192,15 +192,15 @@ class Between:
     node : ndarray of int, shape (M,)
         The node before each.
     motion : Motion
-        At the times.
+        Motion at the times.
     tau, tau_turned : ndarray, shape (M,), s
         Time since the node before, of position and velocity, and of attitude and rate.
     gamma, rate : ndarray, shape (M, 3)
         Local variable of the attitude and its derivative in time.
     states : SmoothStates
-        At the nodes.
+        States at the nodes.
     turns : Turns
-        From node to node.
+        Turns from node to node.
     """
 
     node: IntArray
@@ -291,11 +291,11 @@ def interpolated(
     Parameters
     ----------
     turns : Turns
-        Of the states.
+        Turns of the states.
     time : ndarray, shape (K,), s
-        Of the nodes.
+        Times of the nodes.
     states : SmoothStates
-        At the nodes.
+        States at the nodes.
     node : ndarray of int, shape (M,)
         Nodes before, whose motion goes on where a time is not between them and the next.
     at, turned : ndarray, shape (M,), s

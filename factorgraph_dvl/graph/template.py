@@ -17,7 +17,7 @@ def jacobian_template(keys: list[int], sizes: Sequence[int], rows: int) -> gtsam
     Parameters
     ----------
     keys : list of int
-        Of its variables.
+        Keys of its variables.
     sizes : sequence of int
         Dimensions of the variables.
     rows : int

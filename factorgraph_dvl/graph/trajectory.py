@@ -52,15 +52,15 @@ def trajectory_between(
     Parameters
     ----------
     seg : Segments
-        Of K nodes.
+        Segments of K nodes.
     states : States
-        At the nodes.
+        States at the nodes.
     P : ndarray, shape (K, 9, 9)
         Their covariances, in GTSAM's tangent space.
     gravity_n : ndarray, shape (S, 3)
         `LocalFrame.gravity_without_rotation` along the segments, m/s².
     frame, body_axes : LocalFrame or BodyAxes
-        Of the states, and of what is returned.
+        Frame and axes of the states, and of what is returned.
     time : ndarray, shape (M,), s
         When the motion is wanted.
     """
@@ -95,9 +95,10 @@ class Epochs:
     time : ndarray, shape (M,), s
         The times.
     at : Attachment
-        Of the M times and the ends of the S segments; node i is the one before segment i.
+        Attachment of the M times and the ends of the S segments; node i is the one before
+        segment i.
     duration : ndarray, shape (S,), s
-        Of the segments.
+        Durations of the segments.
     """
 
     time: Array
@@ -126,7 +127,7 @@ def attached_epochs(
     epochs : Epochs
         The times, attached.
     at : Attachment
-        Of the others.
+        Attachment of the others.
     """
     at = attach_with_ends(seg, np.concatenate([others, time]), earth_rate_n)
     epochs = Epochs(time, rows_of(at, slice(others.size, None)), seg.duration)

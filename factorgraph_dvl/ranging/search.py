@@ -53,7 +53,7 @@ class RangingRows:
     range_std, rate_std : ndarray, shape (M,)
         Standard deviations with the noise of dead reckoning.
     since : ndarray, shape (M,), s
-        Since the start of the track.
+        Time since the start of the track.
     """
 
     time: Array

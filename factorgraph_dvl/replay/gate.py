@@ -202,7 +202,7 @@ class Judged:
     Parameters
     ----------
     innovations : tuple of Innovations
-        Of each kind.
+        Innovations of each kind.
     rejected : dict of str to ndarray
         By label, times (K,) of the measurements that are not to be used, s.
     findings : tuple of Finding
@@ -230,7 +230,7 @@ def judged(
     evaluation : Evaluation
         Where it is linear.
     predicted : SquareRootInformation
-        Of the same variables, without the measurements.
+        Square-root information of the same variables, without the measurements.
     new : mapping of str to ndarray of bool
         Measurements (M,) by label.
     gate : InnovationGate
@@ -315,7 +315,7 @@ def _one_after_another(
     residual : ndarray, shape (M d,)
         Predicted - measured, in units of the noise of each.
     covariance : ndarray, shape (M d, M d)
-        Of the prediction.
+        Covariance of the prediction.
     shape : tuple of int
         (M, d).
     """

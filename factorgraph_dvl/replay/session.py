@@ -55,7 +55,7 @@ class Replay:
     Parameters
     ----------
     settings : Trial
-        With an IMU. Everything but its records counts: sensor settings, axes, priors.
+        Trial with an IMU. Everything but its records counts: sensor settings, axes, priors.
     smoother : Kind, default 'fixed-lag'
         Smoother: `fixed-lag` or `isam2`.
     lag_s : float, optional

@@ -277,11 +277,11 @@ class ReplayWithoutImu:
         past : Past
             What left.
         time, density : ndarray, shape (K,) or (K - 1, 6)
-            Of the nodes.
+            Times and densities of the nodes.
         states : SmoothStates
-            Of the first of them.
+            States of the first of them.
         values : mapping of str to ndarray
-            Of the parameters.
+            Values of the parameters.
         until : float
             Time up to which records are read, s.
         """

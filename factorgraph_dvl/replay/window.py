@@ -194,7 +194,8 @@ class Known:
     Parameters
     ----------
     keys, sizes : list of int
-        Of the variables of the node, of processes and of constants, and their dimensions.
+        Keys of the variables of the node, of processes and of constants, and their
+        dimensions.
     root : ndarray, shape (n, n)
         Square root R of their information, upper triangular: R (x - x0) = d + unit noise.
     right : ndarray, shape (n,)
@@ -263,9 +264,9 @@ class Past:
     Parameters
     ----------
     known : Known
-        Of what stays.
+        What is known of what stays.
     processes : tuple of Process
-        As they go on.
+        Processes as they go on.
     nodes : mapping of str to ndarray
         Their nodes (J, size) that stay, by name.
     measured : mapping of str to float
@@ -302,11 +303,11 @@ class Window:
     Parameters
     ----------
     problem : Problem
-        With a chain without IMU.
+        Problem with a chain without IMU.
     evaluation : Evaluation
         Where the step ended.
     information : SquareRootInformation
-        From the elimination of the step, the constants last.
+        Square-root information from the elimination of the step, the constants last.
     """
 
     problem: Problem

@@ -52,7 +52,7 @@ class BiasWalks:
     Parameters
     ----------
     prepared : Preparation
-        With them.
+        Preparation with them.
     evaluation : Evaluation
         The minimum with them.
     against : float

@@ -32,7 +32,7 @@ class ComponentChange:
     Parameters
     ----------
     name : str
-        Of the component.
+        Name of the component.
     parameter : Parameter
         That it belongs to.
     change : Change

@@ -147,7 +147,7 @@ def _unseen(
     o : Observation
         Whose correlation time may be expected.
     residuals : ndarray, shape (M, d)
-        In stated standard deviations; nan where a component was not used.
+        Residuals in stated standard deviations; nan where a component was not used.
     found : collection of tuple of int
         Groups of components of which residuals show what persists.
     time : ndarray, shape (K,), s

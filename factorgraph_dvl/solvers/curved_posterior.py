@@ -47,9 +47,9 @@ def points_along_arc(
     Parameters
     ----------
     found : SolvedProblem
-        Of a planar chain.
+        Solved problem of a planar chain.
     places : ndarray, shape (B, 2), m
-        Of the beacons, east and north.
+        Places of the beacons, east and north.
     report : callable
         Called with stage, iteration and cost.
     """

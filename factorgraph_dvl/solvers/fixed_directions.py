@@ -119,7 +119,7 @@ def undetermined_there(solved: SolvedProblem, free: Problem) -> bool:
     Parameters
     ----------
     solved : SolvedProblem
-        With fixed directions.
+        Solved problem with fixed directions.
     free : Problem
         The same problem without.
     """

@@ -83,9 +83,9 @@ def foremost(axes: Array) -> tuple[str, float]:
     Returns
     -------
     name : str
-        Of the axis.
+        Name of the axis.
     bearing : float, deg
-        From the bow, positive to starboard.
+        Bearing from the bow, positive to starboard.
     """
     is_level = np.hypot(axes[:, 0], axes[:, 1]) > _LEVEL
     index = int(np.argmax(np.where(is_level, axes[:, 0], -np.inf)))

@@ -41,7 +41,7 @@ class TrackedHypothesis:
     born : float
         Time of the last data when it was found, s.
     fit : Track
-        With the data so far, or when it was last followed.
+        Track with the data so far, or when it was last followed.
     weight : float, optional
         Normalised likelihood among all hypotheses, now.
     highest : float, optional
@@ -88,7 +88,7 @@ def follow(
     Parameters
     ----------
     setup : PlanarSetup
-        Of the whole trial.
+        Setup of the whole trial.
     updates : sequence of int
         Numbers of nodes after which to fit, increasing.
     searches : sequence of int

@@ -43,9 +43,9 @@ def squares_of(
     information : SquareRootInformation
         Information there.
     sources : iterable of str
-        Of native factors.
+        Labels of native factors.
     every : int, default 1
-        Of so many factors one is taken.
+        One of so many factors is taken.
     """
     wanted = set(sources)
 

@@ -84,7 +84,7 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
     Parameters
     ----------
     found : SolvedProblem
-        Of the trial.
+        Solved problem of the trial.
     entries : int, optional
         Most entries of the history; where there are more nodes, evenly among them, with the
         first and the last. By default every node has one.
@@ -202,11 +202,11 @@ def as_history(
     fixed : ndarray, shape (P, h)
         Directions of the parameters that are fixed in the problem.
     triangles : ndarray
-        Of `run_filter`.
+        Triangles of `run_filter`.
     undetermined : mapping of int to ndarray
         Further directions that are at their prior, by entry.
     nodes : ndarray of int, optional
-        Of the triangles; by default every node.
+        Nodes of the triangles; by default every node.
     """
     columns = _constants(problem)
     names: list[str] = []

@@ -59,7 +59,7 @@ class Explanation:
     Parameters
     ----------
     parameter : Parameter
-        As it was taken.
+        Parameter as it was taken.
     score : Score
         Its test.
     others : tuple of str or Message

@@ -51,10 +51,10 @@ class Minimum:
     Parameters
     ----------
     evaluation : Evaluation
-        At the last values.
+        Evaluation at the last values.
     square_root : SquareRootInformation or None
-        From QR there, up to the last step, which was small if `converged`; None if no proof was
-        asked for.
+        Square-root information from QR there, up to the last step, which was small if
+        `converged`; None if no proof was asked for.
     converged : bool
         Whether the linear model promises no more.
     iterations : int

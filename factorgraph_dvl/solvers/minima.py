@@ -152,7 +152,7 @@ def distinct(prepared: Prepared, minima: Sequence[SolvedProblem]) -> list[Solved
     prepared : Prepared
         What all started from.
     minima : sequence of SolvedProblem
-        With their covariances.
+        Minima with their covariances.
     """
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     out: list[SolvedProblem] = []
@@ -198,7 +198,7 @@ def joined(
     Parameters
     ----------
     solutions : sequence of Solution
-        Of the living hypotheses.
+        Solutions of the living hypotheses.
     against : ndarray, shape (S,)
         Negative logarithms of their likelihoods, relative to the best.
     hypotheses : sequence of Hypothesis
@@ -230,7 +230,7 @@ def most_probable_minimum(solutions: Sequence[Solution], against: Array) -> Solu
     Parameters
     ----------
     solutions : sequence of Solution
-        At the minima, with the same estimates and epochs.
+        Solutions at the minima, with the same estimates and epochs.
     against : ndarray, shape (S,)
         Negative logarithms of their probabilities.
     """

@@ -59,17 +59,17 @@ class Strengths:
     Parameters
     ----------
     chain : SmoothChain
-        With densities.
+        Chain with densities.
     factors : dict of str to ndarray
         By label, factors (d,) on stated white noise.
     processes : tuple of Process
-        With their deviations.
+        Processes with their deviations.
     tilt : Tilt
         Gradient of the states' volume by the constants.
     states : SmoothStates
-        Of the nodes of this chain.
+        States of the nodes of this chain.
     values : dict of str to ndarray
-        Of all parameters, processes in their new unit.
+        Values of all parameters, processes in their new unit.
     same : bool
         Whether all are about the same as before.
     """
@@ -91,7 +91,7 @@ def motion_strengths(
     Parameters
     ----------
     problem : Problem
-        Of a chain without IMU.
+        Problem of a chain without IMU.
     minimum : Minimum
         Where it ended.
     phase : ndarray of int, shape (K - 1,)
@@ -225,9 +225,9 @@ def _next_tilt(
     values : mapping of str to ndarray
         All parameters.
     covariance : ndarray, shape (P, P)
-        Of the estimated parameters.
+        Covariance of the estimated parameters.
     step : ndarray, shape (P,)
-        To the minimum without a tilt.
+        Step to the minimum without a tilt.
     gradient : ndarray, shape (P,)
         Half that of the log determinant.
     """

@@ -36,7 +36,7 @@ def robust_weights(
     problem : Problem
         Its robust weights are replaced.
     evaluation : Evaluation
-        At a minimum.
+        Evaluation at a minimum.
     """
     groups = {o.label: i for i, o in enumerate(problem.observations) if o.noise_groups}
     if not any(t.worth_it for t in _searches(problem, evaluation, groups).values()):

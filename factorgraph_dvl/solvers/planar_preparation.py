@@ -114,7 +114,7 @@ def prepare_planar(trial: Trial, report: Progress) -> PlanarPreparation:
     Parameters
     ----------
     trial : Trial
-        With compass, log, depth and beacons.
+        Trial with compass, log, depth and beacons.
     report : callable
         Called with stage, iteration and cost.
 

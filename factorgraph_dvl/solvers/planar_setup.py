@@ -50,7 +50,7 @@ class Track:
     Parameters
     ----------
     problem : Problem
-        Of these nodes.
+        Problem of these nodes.
     evaluation : Evaluation
         Its minimum.
     converged : bool
@@ -115,13 +115,13 @@ class PlanarSetup:
     Parameters
     ----------
     trial : Trial
-        With compass, log, depth and beacons.
+        Trial with compass, log, depth and beacons.
     track : DeadReckoning
-        By their records.
+        Track by their records.
     chain : PlanarChain
-        Of the whole trial.
+        Chain of the whole trial.
     observations : tuple of Observation
-        Of log and beacons.
+        Observations of log and beacons.
     known_start : bool
         Whether the prior of the first position is measured, not a mere bound.
     """
@@ -292,7 +292,7 @@ def planar_trajectory(found: SolvedProblem, chain: PlanarChain, rate_hz: float) 
     Parameters
     ----------
     found : SolvedProblem
-        Of a planar chain, at its minimum.
+        Solved problem of a planar chain, at its minimum.
     chain : PlanarChain
         Its chain.
     rate_hz : float

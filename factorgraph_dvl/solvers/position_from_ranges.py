@@ -64,13 +64,13 @@ def positions_from_ranges(
     Parameters
     ----------
     trial : Trial
-        With a record of ranges, or with a known position.
+        Trial with a record of ranges, or with a known position.
     frame : LocalFrame
         Tangent frame of the trial.
     seg : Segments
         Preintegrated segments of the IMU.
     states : States
-        From alignment; without a known position, from an arbitrary one.
+        States from alignment; without a known position, from an arbitrary one.
 
     Raises
     ------

@@ -57,7 +57,7 @@ class _Planned:
     values : dict of str to ndarray
         True values of what is estimated.
     observations, parameters : tuple of Observation or Parameter
-        Of all sensors.
+        Observations and parameters of all sensors.
     processes : tuple of Process, optional
         Beside those of the sensors.
     """
@@ -120,7 +120,7 @@ def continue_posterior(
     trial, true_states : Trial or TrueStates
         As of `predict_posterior`, with an IMU; its priors are not used.
     start : Frontier
-        At the first node.
+        Frontier at the first node.
     """
     problem, evaluation = _at_truth(trial, true_states, {})
     triangles, frontier = run_filter(problem, evaluation, start)

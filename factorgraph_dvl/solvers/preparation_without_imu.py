@@ -84,11 +84,11 @@ class PreparationWithoutImu:
     first_chain : SmoothChain
         Nodes, with densities to start from.
     states : SmoothStates
-        Of the nodes.
+        States of the nodes.
     record : AttitudeRecord
         Whose heading the track follows.
     values : dict of str to ndarray
-        Of clocks and mountings.
+        Values of clocks and mountings.
     phase : ndarray of int, shape (K - 1,)
         What the heading does between nodes: 0 = stays, 1 = turns, 2 = begins or ends to turn.
     observations : tuple of Observation
@@ -96,7 +96,7 @@ class PreparationWithoutImu:
     parameters : tuple of Parameter
         Calibration parameters of all sensors, fixed ones included.
     processes : tuple of Process
-        Of the current, if the velocity is through water.
+        Processes of the current, if the velocity is through water.
     estimated_noise : frozenset of str
         Labels of the observations whose stated noise is only where to start.
     findings : tuple of Finding
@@ -413,13 +413,13 @@ def _without_gross_errors(time: Array, velocity: Array, locked: Array, track: Tr
     Parameters
     ----------
     time : ndarray, shape (M,), s
-        Of the pings.
+        Times of the pings.
     velocity : ndarray, shape (M, 3), m/s
-        By the DVL.
+        Velocities by the DVL.
     locked : ndarray of bool, shape (M,)
         Whether there is a velocity.
     track : Track
-        Of the body.
+        Track of the body.
     """
     _, v_n, covered = track.at(time)
     known = np.flatnonzero(covered & (locked > 0))
@@ -456,7 +456,7 @@ def _nodes(
     record : AttitudeRecord
         How the body points.
     track : Track
-        Of the body.
+        Track of the body.
     late, lag : float, s
         Time offsets of the attitude and of the nodes.
     """

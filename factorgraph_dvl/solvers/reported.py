@@ -29,9 +29,9 @@ class Reported:
     parameter : Parameter
         What it is.
     value : ndarray, shape (n,)
-        In its unit.
+        Value in its unit.
     derivative : ndarray, shape (n, n), SI
-        Of `value` by the parameter's tangent space.
+        Derivative of `value` by the parameter's tangent space.
     """
 
     parameter: Parameter

@@ -67,7 +67,7 @@ class Proposal:
     model : Model
         What is assumed.
     states, values : object and dict of str to ndarray
-        Of the nodes, and all parameters.
+        States of the nodes, and values of all parameters.
     rough : bool, default False
         Whether the minimisation may end early, as another one follows.
     """

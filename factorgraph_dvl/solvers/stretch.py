@@ -34,7 +34,7 @@ def started_from_stretch(
     Parameters
     ----------
     prepared : PreparationWithoutImu
-        Of the whole trial.
+        Preparation of the whole trial.
     report : callable
         Called with stage, iteration and cost.
     """

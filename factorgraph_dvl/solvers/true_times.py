@@ -75,7 +75,7 @@ def trajectory_at_true_times(
     Parameters
     ----------
     problem : Problem
-        Of a chain without IMU.
+        Problem of a chain without IMU.
     evaluation : Evaluation
         Its minimum.
     covariances : Posterior

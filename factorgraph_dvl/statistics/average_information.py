@@ -77,7 +77,7 @@ def restricted_score(
     count : int
         How many strengths there are.
     information : SquareRootInformation
-        Of all variables.
+        Square-root information of all variables.
     """
     squares, freedom, own = np.zeros((3, count))
     sums: dict[int, Array] = {}

@@ -86,7 +86,7 @@ def changes(
     with_components : dict of int to ndarray
         Covariance of every variable with the P components, (size, P) by key.
     covariance : ndarray, shape (P, P)
-        Of the components.
+        Covariance of the components.
     span : tuple of (float, float)
         First and last time, s.
     gradient : mapping of int to ndarray, optional

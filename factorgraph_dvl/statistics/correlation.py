@@ -85,7 +85,7 @@ def fit_correlation(
     time : ndarray, shape (M,), s
         Increasing; gaps are left out.
     residuals : ndarray, shape (M, d)
-        Of components whose noise is alike, scaled to one unit; nan where there is none.
+        Residuals of components whose noise is alike, scaled to one unit; nan where there is none.
     expected_time_s : float, optional
         Correlation time that is stated or usual, with a factor of three.
     """

@@ -93,7 +93,7 @@ def marginal_objective(
     evaluation : Evaluation
         Where the graph is linear.
     information : SquareRootInformation
-        From the elimination there, the constants last.
+        Square-root information from the elimination there, the constants last.
     """
     given = information.given(constants_of(problem))
     return _objective(problem, evaluation, given.decrease, given.log_determinant)
@@ -120,7 +120,7 @@ def _objective(
     Parameters
     ----------
     problem : Problem
-        With weights.
+        Problem with weights.
     evaluation : Evaluation
         Where the graph is linear.
     decrease : float
@@ -175,11 +175,11 @@ def log_determinant_gradient(
     Parameters
     ----------
     problem : Problem
-        With weights.
+        Problem with weights.
     evaluation : Evaluation
         Where the graph is linear.
     information : SquareRootInformation
-        From the elimination there, the constants last.
+        Square-root information from the elimination there, the constants last.
     with_states : dict, optional
         `by_place` of all rows of observations, where that is known.
     """
@@ -266,7 +266,7 @@ def leverage_of(
     Parameters
     ----------
     rows : Rows
-        Of the graph.
+        Rows of the graph.
     with_states : ndarray, shape (M, d, n)
         Their `covariance_with_states`.
     with_constants : mapping of int to ndarray

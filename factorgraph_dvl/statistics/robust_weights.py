@@ -50,8 +50,8 @@ class Truncation:
     Parameters
     ----------
     residuals : ndarray, shape (M, d)
-        At the start, in standard deviations; nan where a component is not used. Their scale is
-        frozen there.
+        Residuals at the start, in standard deviations; nan where a component is not used. Their
+        scale is frozen there.
     apart : bool
         Whether components are outliers each for itself.
     unit : ndarray, shape (d,), or float, default 1
@@ -107,7 +107,7 @@ def misfit(
     Parameters
     ----------
     residuals : ndarray, shape (M, d)
-        In the standard deviations `sigma`; nan where a component is not used.
+        Residuals in the standard deviations `sigma`; nan where a component is not used.
     sigma : ndarray, shape (M, d)
         Standard deviations in the unit of the measurement.
     rejected : ndarray of bool, shape (M, d) or (M, 1)

@@ -68,7 +68,7 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     rows : Rows
         M items of d rows.
     factors : ndarray, shape (M, d, n)
-        Of each row.
+        Factors of each row.
     sums : dict of int to ndarray
         By key; changed.
     """
@@ -92,7 +92,7 @@ def with_own_covariance(
     parts : sequence of tuple of ndarray
         Keys (M, k) of the variables of each item, and its rows J by these (M, d, n).
     information : SquareRootInformation
-        Of all variables.
+        Square-root information of all variables.
     """
     place: dict[tuple[int, ...], int] = {}
     out = [np.zeros_like(matrix) for _, matrix in parts]
@@ -133,11 +133,11 @@ def native_rows(problem: Problem, evaluation: Evaluation, every: int = 1) -> Ite
     Parameters
     ----------
     problem : Problem
-        With weights.
+        Problem with weights.
     evaluation : Evaluation
         Where the graph is linear.
     every : int, default 1
-        Of so many factors one is taken, from the first on.
+        One of so many factors is taken, from the first on.
     """
     yield from problem.chain_rows(evaluation)
     gaussian = problem.native(evaluation)

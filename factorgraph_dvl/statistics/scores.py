@@ -67,7 +67,7 @@ class Scores:
     score : ndarray, shape (C,)
         Downward gradient of the cost, 1/SI.
     information : ndarray, shape (C, C)
-        Of the data, 1/SI².
+        Information of the data, 1/SI².
     wide : ndarray, shape (C,)
         Standard deviations of the wide priors, SI: what the data do not inform on stays there.
     """
@@ -108,7 +108,7 @@ def scores(
     delta : gtsam.VectorValues
         Step to the minimum of the graph.
     information : SquareRootInformation
-        Of the graph.
+        Square-root information of the graph.
     candidates : mapping of str to tuple of (int, ndarray)
         By name, key and standard deviations (n,) of the wide prior.
     """

@@ -136,15 +136,15 @@ def spurious_by(
     Parameters
     ----------
     observation : Observation
-        Of M measurements of d components.
+        Observation of M measurements of d components.
     attachment, motion : Attachment or Motion
-        Of them.
+        Attachment or motion of them.
     weight : ndarray, shape (M, d)
         Inverse standard deviations.
     P : ndarray, shape (K, 9, 9)
         Covariances of the nodes to which they are attached, in GTSAM's tangent space.
     values : Values
-        Of all parameters.
+        Values of all parameters.
     wanted : sequence of str
         Names of the parameters, of p columns, whose information is asked for.
     clock_zero : float

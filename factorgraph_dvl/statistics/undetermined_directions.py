@@ -99,11 +99,11 @@ def data_information(
     evaluation : Evaluation
         Its minimum.
     parameter_covariance : ndarray, shape (P, P)
-        In the coordinates u of a step S u, S `Problem.prior_root`.
+        Covariance in the coordinates u of a step S u, S `Problem.prior_root`.
     state_covariances : ndarray, shape (K, 9, 9)
         Covariances of the states where the parameters are exact, in GTSAM's tangent space.
     information : SquareRootInformation
-        On all variables.
+        Square-root information on all variables.
     at_truth : bool, default False
         Whether the motion there is the true one, which adds nothing spurious: return what will be
         found once it is estimated.

@@ -79,7 +79,7 @@ def in_order(second_of_day: Array, date: Array) -> Array:
     second_of_day : ndarray, shape (N,), s
         Seconds of the day in the order of their arrival; nan where not known.
     date : ndarray, shape (N,), s
-        Since 1970, of the day's start; nan where it was not given.
+        Start of the day since 1970; nan where it was not given.
 
     Returns
     -------
