@@ -141,3 +141,14 @@ def test_the_drawing_shows_places_to_scale_and_where_the_dvl_points(yaw, starboa
     right, up = np.array(forward.xy) - [1.0, 2.0]
     assert up > 0.0
     assert np.sign(round(right, 9)) == starboard_of_bow
+
+
+def test_axes_of_the_drawing_have_the_signs_of_what_is_entered(tmp_path, sheets):
+    write_pdf(whole_result(), tmp_path / "report.pdf")
+    above, side = [ax for ax in sheets[0].figure.axes if ax.axison]
+    assert [above.get_xlabel(), above.get_ylabel()] == ["starboard, m", "forward, m"]
+    assert [side.get_xlabel(), side.get_ylabel()] == ["forward, m", "down, m"]
+    # What is above the reference point has a negative place down.
+    assert side.yaxis.get_major_formatter()(1.4, 0) == "−1.4"
+    assert side.xaxis.get_major_formatter()(1.4, 0) == "1.4"
+    assert any("do not enter them" in text.lower() for text in texts(sheets[2]))

@@ -74,12 +74,18 @@ def draw_vessel(
     for place, xy in zip(places, points, strict=True):
         _draw_ellipse(ax, xy, view @ place.covariance @ view.T)
     ax.plot(*points.T, "o", color=DARK, ms=4)
+    # A name stands on the side without other points; that of the DVL, where its axes leave room.
+    sides = [*(points[:-1] - points.mean(axis=0)), -(view @ axes.sum(axis=1))]
     done: list[Array] = []
-    for place, xy in zip(places, points, strict=True):
+    for place, xy, side in zip(places, points, sides, strict=True):
         lines = sum(float(np.hypot(*(xy - other))) < 0.08 * span for other in done)
         done.append(xy)
-        ax.annotate(said(place.name), xy, xytext=(5, 5 + 9 * lines), textcoords="offset points",
-                    fontsize=SMALL, fontweight="bold", color=DARK)  # fmt: skip
+        right, up = side >= -1e-9
+        ax.annotate(
+            said(place.name), xy, (5 if right else -5, (1 if up else -1) * (5 + 9 * lines)),
+            textcoords="offset points", fontsize=SMALL, fontweight="bold", color=DARK,
+            ha="left" if right else "right", va="bottom" if up else "top",
+        )  # fmt: skip
 
 
 def _draw_ellipse(ax: Axes, at: Array, covariance: Array) -> None:
