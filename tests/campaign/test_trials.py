@@ -163,6 +163,7 @@ def test_the_page_is_whole_and_leads_to_the_results(campaign):
     assert {"trials/a/report.html", "trials/b/calibration.json"} == links
     assert all((out / link).exists() for link in links)
     assert "a &lt;table&gt; is missing" in text
+    assert "lever arm starboard" in text
     shown = text[text.index("<main") : text.index("</main>")]
     assert "nan" not in shown
     headings = re.findall(r"<h[123][^>]*>(.*?)</h[123]>", shown)

@@ -63,10 +63,11 @@ def commands(root: Path, out: Path) -> dict[str, list[object]]:
             "--attitude",
             root / "bad",
         ],
+        "export": ["export", root / "bad", "--to", "urdf", "--out", out],
     }
 
 
-@pytest.mark.parametrize("name", ["crosscheck", "deadreckon", "attitude"])
+@pytest.mark.parametrize("name", ["crosscheck", "deadreckon", "attitude", "export"])
 def test_a_result_that_is_not_to_be_used_is_refused(
     name: str, folder: Path, tmp_path: Path, run: Run
 ) -> None:

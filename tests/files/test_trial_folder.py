@@ -262,6 +262,7 @@ def test_a_file_that_is_no_trial_is_an_error(tmp_path: Path, text: str, expected
         load_trial(tmp_path)
     assert str(caught.value).startswith("trial.yaml")
     assert expected in str(caught.value)
+    assert ": :" not in str(caught.value)
 
 
 def test_an_explosion_of_aliases_is_an_error(tmp_path: Path) -> None:
