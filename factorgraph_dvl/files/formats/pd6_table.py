@@ -29,7 +29,7 @@ _START = b":SA,"
 # Rows by which lengths are judged, and the share of a type that has one length.
 _JUDGED, _SAME_LENGTH = 20_000, 0.9
 _CLOCK = "pings have the times at which a computer received them; the clock of the DVL is not used"
-_WIDTHS = "lines have {} characters: others have lost some, and were left out"
+_WIDTHS = "whole lines have {} characters: lines of other lengths were left out"
 
 
 def share(path: Path, sample: bytes) -> float:
