@@ -51,14 +51,13 @@ def _agreeing(found: Array) -> int:
     return int(np.sum(best == np.argmax(_TABLE_3[:, :6], axis=0)))
 
 
-def _drawn(found: Array) -> Figure:
-    """Draw both tables on the same axes."""
-    figure = new_figure(10.0, 4.2)
-    grid = new_grid(figure, 1, 2)
-    for column, (title, values) in enumerate(
-        (("as printed", _TABLE_3), ("rows less their mean", found))
-    ):
-        ax = figure.add_subplot(grid[0, column])
+def _drawn(parts: dict[str, Array]) -> Figure:
+    """Draw the printed table and its readings on the same axes."""
+    tables = {"as printed": _TABLE_3, **{f"rows {name}": values for name, values in parts.items()}}
+    figure = new_figure(10.0, 8.0)
+    grid = new_grid(figure, 2, 2)
+    for place, (title, values) in enumerate(tables.items()):
+        ax = figure.add_subplot(grid[place // 2, place % 2])
         for row, (name, color, marker) in enumerate(
             zip(_MANOEUVRES, (GREY, DARK, "tab:orange", ACCENT), "svo^", strict=True)
         ):
@@ -67,7 +66,8 @@ def _drawn(found: Array) -> Figure:
             ax.semilogy(where, shown, marker, color=color, ms=4, label=name)
         ax.set_ylim(_LEAST / 3.0, 10.0)
         ax.set_xticks(range(7), _STATES)
-        ax.set_title(title, fontsize=9, loc="left")
+        zero = f" (0 is drawn at {_LEAST:g})" if np.any(values == 0.0) else ""
+        ax.set_title(f"{title}{zero}", fontsize=9, loc="left")
         style(ax, "", "observability")
     figure.axes[0].legend(fontsize=7)
     return figure
@@ -112,7 +112,7 @@ def _table_3(seeds: int) -> Result:
             "begins with 1 s straight ahead. The printed values are no singular values of the "
             f"stacked matrix: a steady 4 m/s has three of 4 √N = {steady[2]:.0f}.",
         ),
-        _drawn(found),
+        _drawn(parts),
     )
 
 

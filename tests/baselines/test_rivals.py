@@ -60,15 +60,23 @@ def test_adaptive_identification_converges_at_any_scale(turn):
 
 def test_one_step_of_adaptive_identification_by_hand():
     # Ahead is taken for starboard: the estimate turns by a tenth of the sine about the vertical.
-    points = exact_points(2)
     ahead = replace(
-        points,
-        v_b=np.tile([0.0, 2.0, 0.0], (2, 1)),
-        omega_b=np.zeros((2, 3)),
-        v_d=np.tile([2.0, 0.0, 0.0], (2, 1)),
+        rows_of(exact_points(2), slice(0, 1)),
+        v_b=np.array([[0.0, 2.0, 0.0]]),
+        omega_b=np.zeros((1, 3)),
+        v_d=np.array([[2.0, 0.0, 0.0]]),
     )
     R = kinsey_whitcomb(ahead, MISALIGNMENT, np.zeros(3)).estimated.values[0]
-    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, -0.2], atol=1e-12)
+    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, -0.1], atol=1e-12)
+
+
+def test_a_gap_between_pings_is_no_long_step():
+    points = exact_points(200, misalignment=[0.0, 0.0, 0.5], arm=ARM)
+    gap = replace(points, time=points.time + 600.0 * (points.time > points.time[100]))
+    found, same = (
+        kinsey_whitcomb(p, MISALIGNMENT, ARM).estimated.values[0] for p in (gap, points)
+    )
+    np.testing.assert_array_equal(found, same)
 
 
 def track(R, scale, arm, *, straight=False):
