@@ -271,7 +271,8 @@ The methods estimate different things, so one number compares them: the velocity
 DVL that is still wrong along the track, as RMS over that of the speed. It includes the effect of
 everything that a method neglects. So `kinsey-whitcomb`, which has no scale as published, keeps the
 scale error of 17.7 ‰, and `three-points` keeps the angle about the bow as the trial states it.
-Few seeds do not rank methods whose errors are close.
+The heading error of SINS/GNSS is new in each seed. It is most of the error in scenarios 5 and 7:
+few seeds do not rank the methods there.
 """
 
 

@@ -116,6 +116,29 @@ def test_three_points_find_two_angles_and_the_scale():
     assert np.linalg.norm(wrong.estimated.values[0] @ ahead - turn @ ahead) > 0.1
 
 
+@pytest.mark.parametrize("astern", [False, True])
+@pytest.mark.parametrize("degrees", [120.0, 175.0, 180.0])
+def test_three_points_find_a_large_turn(degrees, astern):
+    turn = exp_so3(np.array([0.0, 0.0, np.radians(degrees)]))
+    motion, v_d = track(turn, 0.01, np.zeros(3))
+    if astern:
+        back = exp_so3(np.array([0.0, 0.0, np.pi]))
+        motion, turn = replace(motion, nRb=motion.nRb @ back), turn @ back
+    outcome = three_points(motion, v_d, MISALIGNMENT, SCALE, np.zeros(3), "RFU")
+    assert outcome.converged
+    found, scale = outcome.estimated.values
+    ahead = np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(found @ ahead, turn @ ahead, atol=1e-4)
+    np.testing.assert_allclose(scale, 0.01, atol=1e-4)
+
+
+def test_three_points_keep_a_misalignment_that_is_known():
+    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01, np.zeros(3))
+    known = parameter("misalignment", np.array([0.0, 0.0, 0.3]), np.zeros(3))
+    R = three_points(motion, v_d, known, SCALE, np.zeros(3), "RFU").estimated.values[0]
+    assert angle(R, exp_so3(np.array([0.0, 0.0, 0.3]))) < 1e-6
+
+
 def test_three_points_are_needed():
     motion, v_d = track(np.eye(3), 0.0, np.zeros(3))
     few = replace(motion, time=motion.time[:2], nRb=motion.nRb[:2], geodetic=motion.geodetic[:2])
