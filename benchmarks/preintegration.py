@@ -137,17 +137,18 @@ def sample() -> list[str]:
 
 
 INTRODUCTION = """\
-# GTSAM's preintegration, and what is put in front of it here
+# GTSAM's preintegration of raw samples, and of increments without coning
 
 {origin}
 
 GTSAM's factors take samples of an IMU one by one, each as a constant rate and force in the body.
-In a sway, the axis of rotation turns within a sample. The neglected part adds up to a drift
-(coning), and a solver would take it for a bias of the gyros. This package first makes increments
-from a polynomial through neighbouring samples ([model](model.md#from-imu-samples-to-increments)).
-It then gives them to GTSAM's Galilean preintegration. This page measures the attitude over seconds
-against the exact one, for samples that are means over their interval, without noise. A
-navigation-grade gyro has a bias of 0.02 °/h.
+If roll and pitch sway a quarter period apart (in quadrature), the axis of rotation turns within a
+sample. GTSAM neglects that, and the error adds up to a drift of the attitude (coning). A solver
+would take the drift for a bias of the gyros. This package first makes increments from a polynomial
+through neighbouring samples ([model](model.md#from-imu-samples-to-increments)). It then gives them
+to GTSAM's Galilean preintegration, the classes whose names end in G. This page compares the turn
+over each second with the exact one, and gives the mean error as a drift. The samples are means
+over their interval, without noise. For comparison: a navigation-grade gyro has a bias of 0.02 °/h.
 """
 
 

@@ -62,8 +62,9 @@ MEMS = {
 # Changes to the base, by name: `configs/cruise.yaml` with the turns above.
 SCENARIOS: dict[str, dict[str, Any]] = {
     "base: RTK, swell, turns": {},
+    # The statement is off by 5, -4 and 6 cm.
     "lever arm measured to 5 cm": {
-        "trial": {"dvl": {"lever_arm_m": [-0.93, 1.12, -0.34], "lever_arm_std_m": [0.05] * 3}},
+        "trial": {"dvl": {"lever_arm_m": [-0.88, 1.08, -0.28], "lever_arm_std_m": [0.05] * 3}},
     },
     "misalignment of 0.7°, known to 3°": {
         "dvl": {"misalignment_deg": [0.5, -0.3, 0.4]},
@@ -268,7 +269,10 @@ method gets the statements of the trial, and no tuning by scenario.
 
 The methods estimate different things, so one number compares them: the velocity of the calibrated
 DVL that is still wrong along the track, as RMS over that of the speed. It includes the effect of
-everything that a method neglects.
+everything that a method neglects. So `kinsey-whitcomb`, which has no scale as published, keeps the
+scale error of 17.7 ‰, and `three-points` keeps the angle about the bow as the trial states it.
+The heading error of SINS/GNSS is new in each seed. It is most of the error in scenarios 5 and 7:
+few seeds do not rank the methods there.
 """
 
 

@@ -387,4 +387,7 @@ def _neglects(method: DvlMethod, dvl: Dvl) -> list[Finding]:
     if method in _NO_SIGMA:
         text = message("method_limits.no_sigma", method=method)
         out.append(Finding(Code.METHOD_LIMITS, text))
+    if method == "three-points":
+        text = message("method_limits.positions_alone", method=method)
+        out.append(Finding(Code.METHOD_LIMITS, text))
     return out

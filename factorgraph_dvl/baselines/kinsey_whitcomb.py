@@ -6,7 +6,8 @@ With y = R u, R constant, the estimate turns towards what it predicts wrongly,
 
 and converges from almost any start where u turns in the body. Here u is the velocity of the body
 at the DVL, by SINS/GNSS, and y that of the DVL. There is no scale, no lever arm, no noise and no
-covariance in it. The gain k is free.
+covariance in it. The gain k is free. All pings are steps of the same length: a gap between two of
+them would else be one long step, which turns too far.
 
 J. C. Kinsey and L. L. Whitcomb, Adaptive identification on the group of rigid-body rotations and
 its application to underwater vehicle navigation, IEEE Trans. Robotics 23(1), 124-136, 2007.
@@ -42,9 +43,8 @@ def kinsey_whitcomb(points: Points, misalignment: Parameter, lever_arm: Array) -
         Lever arm of the DVL, taken as known.
     """
     R, u = exp_so3(misalignment.mean), points.at_dvl(lever_arm)
-    step = np.diff(points.time, prepend=points.time[:1])
-    power = float(step @ np.sum(u**2, axis=1))
+    power = float(np.sum(u**2))
     gain = _PER_PING * len(points) / power if power > 0.0 else 0.0
     for k in range(len(points)):
-        R = exp_so3(gain * step[k] * np.cross(R @ u[k], points.v_d[k])) @ R
+        R = exp_so3(gain * np.cross(R @ u[k], points.v_d[k])) @ R
     return Outcome(by_residuals(points, (misalignment,), (R,), lever_arm), 1)

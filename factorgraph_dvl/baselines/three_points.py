@@ -6,7 +6,8 @@ last, is compared with their positions,
     D_j = sum C Exp(-a) R' v_d dt / (1 + k),    j = 1, 2,
 
 and the angles across the bow and the scale follow, again and again until nothing changes. A
-vehicle moves along its bow, so the angle about the bow stays that of the prior. Nothing but three
+vehicle moves along its bow: so the search starts with the mean velocity of the DVL along it, and
+the angle about the bow stays that of the prior. Nothing but three
 positions is needed of GNSS; here they and the attitude are those of SINS/GNSS. The standard
 deviations are those that the positions make, as the publication has none.
 
@@ -75,7 +76,10 @@ def three_points(
     # Columns: two angles across the bow, and the scale.
     free = np.vstack([np.column_stack([across, np.zeros(2)]), np.eye(4)[3]])
     of_prior = np.linalg.inv(free @ _regular(prior.covariance) @ free.T)
-    moved_by, step, count = np.zeros(3), np.ones(3), 0
+    ahead = _path(motion, np.broadcast_to(bow, v_d.shape), rows)
+    start = _turn(np.copysign(1.0, np.sum(truth * ahead)) * bow, v_d.mean(axis=0) @ R, across[0])
+    R = R @ exp_so3(start)
+    moved_by, step, count = np.append(across @ start, 0.0), np.ones(3), 0
     while np.abs(step).max() > _SETTLED and count < _STEPS:
         count += 1
         b = v_d @ R / (1.0 + k)
@@ -98,6 +102,15 @@ def three_points(
 def _regular(covariance: Array) -> Array:
     """Return a covariance that can be inverted where something is known exactly."""
     return covariance + 1e-18 * np.eye(len(covariance))
+
+
+def _turn(a: Array, b: Array, beside: Array) -> Array:
+    """Return the shortest turn from a unit vector to a direction; half a turn is `beside`."""
+    axis = np.cross(a, b)
+    sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
+    if sine == 0.0:
+        return np.pi * beside if cosine < 0.0 else np.zeros(3)
+    return np.arctan2(sine, cosine) / sine * axis
 
 
 def _path(motion: NavigationMotion, velocity_b: Array, rows: tuple[int, ...]) -> Array:

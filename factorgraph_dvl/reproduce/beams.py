@@ -202,8 +202,9 @@ def _step_4(seeds: int) -> Result:
     return Result(
         f"v_n' = v_n − φ × v_n holds to {apart:.0e}; the EKF on velocities of four groups in n' "
         f"finds α_i and θ_i from up to {nominal:.2f}° off to {largest:.3f}°, with errors of "
-        f"{ratio:.1f} σ (it counts errors of groups as independent; {counted(seeds)}). Claim 6 of "
-        "the copy breaks off in the error equations: derived anew",
+        f"{ratio:.1f} σ (it counts the errors of groups, and of the velocity from ping to ping, "
+        "as independent; "
+        f"{counted(seeds)}). Claim 6 of the copy breaks off in the error equations: derived anew",
         judged(False, apart < _ZERO and largest < 0.1 * nominal),
     )
 

@@ -458,7 +458,7 @@ def _table_1(seeds: int) -> Result:
 
 
 def _model(seeds: int) -> Result:
-    """Compare the filter's H with differences of its own predictions, in one update."""
+    """Compare the error of 4SV-3OB with its standard deviation, from the true start."""
     trial = _trial("two turns", 0)
     mean = _truth(trial, np.array([1.0]))[0]
     near = run_filter(trial, "4sv-3ob", mean, np.full(2, 1.0))

@@ -51,14 +51,13 @@ def _agreeing(found: Array) -> int:
     return int(np.sum(best == np.argmax(_TABLE_3[:, :6], axis=0)))
 
 
-def _drawn(found: Array) -> Figure:
-    """Draw both tables on the same axes."""
-    figure = new_figure(10.0, 4.2)
-    grid = new_grid(figure, 1, 2)
-    for column, (title, values) in enumerate(
-        (("as printed", _TABLE_3), ("rows less their mean", found))
-    ):
-        ax = figure.add_subplot(grid[0, column])
+def _drawn(parts: dict[str, Array]) -> Figure:
+    """Draw the printed table and its readings on the same axes."""
+    tables = {"as printed": _TABLE_3, **{f"rows {name}": values for name, values in parts.items()}}
+    figure = new_figure(16.0, 4.2)
+    grid = new_grid(figure, 1, 4)
+    for place, (title, values) in enumerate(tables.items()):
+        ax = figure.add_subplot(grid[0, place])
         for row, (name, color, marker) in enumerate(
             zip(_MANOEUVRES, (GREY, DARK, "tab:orange", ACCENT), "svo^", strict=True)
         ):
@@ -68,7 +67,7 @@ def _drawn(found: Array) -> Figure:
         ax.set_ylim(_LEAST / 3.0, 10.0)
         ax.set_xticks(range(7), _STATES)
         ax.set_title(title, fontsize=9, loc="left")
-        style(ax, "", "observability")
+        style(ax, "", "" if place else f"observability (0 is drawn at {_LEAST:g})")
     figure.axes[0].legend(fontsize=7)
     return figure
 
@@ -106,13 +105,15 @@ def _table_3(seeds: int) -> Result:
         ),
         (
             *lines,
-            "A column of a state: what is left of it beside the other six, over √N, in rad, 1 and "
-            "m. The paper argues by the change of H. Rows less their mean are this argument: an "
-            "unknown constant offset of the velocity stands beside the seven states. The turn "
-            "begins with 1 s straight ahead. The printed values are no singular values of the "
-            f"stacked matrix: a steady 4 m/s has three of 4 √N = {steady[2]:.0f}.",
+            "Each value is that part of the column of a state in H that the other six columns "
+            "cannot replace, over √N. 0: the manoeuvre does not show the state. The paper argues "
+            "by the change of H, and two readings follow it. Rows less their mean: the velocity "
+            "has a constant offset that nobody knows. Rows less the first: only what changes "
+            "after the first ping counts. The turn begins with 1 s straight ahead. The printed "
+            "values are no singular values of the stacked matrix: a steady 4 m/s has three of "
+            f"4 √N = {steady[2]:.0f}.",
         ),
-        _drawn(found),
+        _drawn(parts),
     )
 
 

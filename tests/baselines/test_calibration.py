@@ -124,6 +124,22 @@ def test_small_misalignments_come_out_as_published(method, nearly_aligned):
     np.testing.assert_allclose(solution.estimate("scale_error").value, 0.005, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("method", "text"),
+    [
+        ("kinsey-whitcomb", "no standard deviations of its own"),
+        ("differential-evolution", "no standard deviations of its own"),
+        ("three-points", "errors of the positions alone"),
+        ("wahba", None),
+    ],
+)
+def test_a_method_says_what_its_standard_deviations_are_not(method, text, nearly_aligned):
+    said = of_code(kalman(nearly_aligned, method).findings, Code.METHOD_LIMITS)
+    of_sigma = [s for s in said if "no standard deviations" in s or "positions alone" in s]
+    assert len(of_sigma) == (text is not None)
+    assert all(text in s for s in of_sigma)
+
+
 def test_bad_input():
     trial = simulate(scenario())
     with pytest.raises(DataError, match="needs GNSS positions"):

@@ -60,15 +60,23 @@ def test_adaptive_identification_converges_at_any_scale(turn):
 
 def test_one_step_of_adaptive_identification_by_hand():
     # Ahead is taken for starboard: the estimate turns by a tenth of the sine about the vertical.
-    points = exact_points(2)
     ahead = replace(
-        points,
-        v_b=np.tile([0.0, 2.0, 0.0], (2, 1)),
-        omega_b=np.zeros((2, 3)),
-        v_d=np.tile([2.0, 0.0, 0.0], (2, 1)),
+        rows_of(exact_points(2), slice(0, 1)),
+        v_b=np.array([[0.0, 2.0, 0.0]]),
+        omega_b=np.zeros((1, 3)),
+        v_d=np.array([[2.0, 0.0, 0.0]]),
     )
     R = kinsey_whitcomb(ahead, MISALIGNMENT, np.zeros(3)).estimated.values[0]
-    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, -0.2], atol=1e-12)
+    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, -0.1], atol=1e-12)
+
+
+def test_a_gap_between_pings_is_no_long_step():
+    points = exact_points(200, misalignment=[0.0, 0.0, 0.5], arm=ARM)
+    gap = replace(points, time=points.time + 600.0 * (points.time > points.time[100]))
+    found, same = (
+        kinsey_whitcomb(p, MISALIGNMENT, ARM).estimated.values[0] for p in (gap, points)
+    )
+    np.testing.assert_array_equal(found, same)
 
 
 def track(R, scale, arm, *, straight=False):
@@ -106,6 +114,29 @@ def test_three_points_find_two_angles_and_the_scale():
     transposed = replace(motion, nRb=motion.nRb.transpose(0, 2, 1))
     wrong = three_points(transposed, v_d, MISALIGNMENT, SCALE, np.zeros(3), "RFU")
     assert np.linalg.norm(wrong.estimated.values[0] @ ahead - turn @ ahead) > 0.1
+
+
+@pytest.mark.parametrize("astern", [False, True])
+@pytest.mark.parametrize("degrees", [120.0, 175.0, 180.0])
+def test_three_points_find_a_large_turn(degrees, astern):
+    turn = exp_so3(np.array([0.0, 0.0, np.radians(degrees)]))
+    motion, v_d = track(turn, 0.01, np.zeros(3))
+    if astern:
+        back = exp_so3(np.array([0.0, 0.0, np.pi]))
+        motion, turn = replace(motion, nRb=motion.nRb @ back), turn @ back
+    outcome = three_points(motion, v_d, MISALIGNMENT, SCALE, np.zeros(3), "RFU")
+    assert outcome.converged
+    found, scale = outcome.estimated.values
+    ahead = np.array([0.0, 1.0, 0.0])
+    np.testing.assert_allclose(found @ ahead, turn @ ahead, atol=1e-4)
+    np.testing.assert_allclose(scale, 0.01, atol=1e-4)
+
+
+def test_three_points_keep_a_misalignment_that_is_known():
+    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01, np.zeros(3))
+    known = parameter("misalignment", np.array([0.0, 0.0, 0.3]), np.zeros(3))
+    R = three_points(motion, v_d, known, SCALE, np.zeros(3), "RFU").estimated.values[0]
+    assert angle(R, exp_so3(np.array([0.0, 0.0, 0.3]))) < 1e-6
 
 
 def test_three_points_are_needed():
