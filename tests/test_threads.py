@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
-from itertools import combinations
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -66,7 +66,7 @@ def test_two_threads_solve_two_trials_as_one_does(trials):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", [*combinations(TRIALS, 2)], ids="-".join)
+@pytest.mark.parametrize("pair", [*pairwise([*TRIALS, next(iter(TRIALS))])], ids="-".join)
 def test_two_threads_solve_trials_of_all_kinds_as_one_does(trials, pair):
     paths = [trials / name for name in pair]
     assert output_of("solve", "together", *paths) == output_of("solve", "apart", *paths)
