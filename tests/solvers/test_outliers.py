@@ -117,4 +117,5 @@ def test_errors_are_those_of_clean_data(case):
     assert named >= 0.95
     assert lost <= 0.005
     rms = np.sqrt(np.mean(np.square(own), axis=0) / np.mean(np.square(reference), axis=0))
-    assert np.all(rms < 1.5)
+    # Over 20 seeds; the scatter of a ratio falls with the root of their number.
+    assert np.all(rms < 1.0 + 0.5 * np.sqrt(20.0 / RUNS))

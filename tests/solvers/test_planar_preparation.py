@@ -125,7 +125,7 @@ def test_hypotheses_are_written(tmp_path, capsys):
     assert exit_info.value.code == 0
     captured = capsys.readouterr()
     assert "Hypotheses" in captured.out
-    assert "ambiguous" in captured.err
+    assert "ambiguous" in captured.out
     items = json.loads((tmp_path / "s" / "hypotheses.json").read_text())["hypotheses"]
     assert [i["died_s"] for i in items[:2]] == [None, None]
     assert (tmp_path / "s" / items[1]["trajectory"]).exists()
