@@ -106,7 +106,8 @@ def test_one_beam_is_left_out_alone():
 @pytest.mark.parametrize("case", list(CASES))
 def test_errors_are_those_of_clean_data(case):
     own, reference, shares = [], [], []
-    for seed in range(RUNS):
+    # A ratio of a few errors scatters by itself.
+    for seed in range(max(RUNS, 6)):
         trial = simulate(config("seed-a-phase-90"), seed)
         errors, named, lost, _ = judged(trial, seed, case)
         exact = solve(trial, rate_hz=1.0)
@@ -117,5 +118,4 @@ def test_errors_are_those_of_clean_data(case):
     assert named >= 0.95
     assert lost <= 0.005
     rms = np.sqrt(np.mean(np.square(own), axis=0) / np.mean(np.square(reference), axis=0))
-    # Over 20 seeds; the scatter of a ratio falls with the root of their number.
-    assert np.all(rms < 1.0 + 0.5 * np.sqrt(20.0 / RUNS))
+    assert np.all(rms < 1.5), rms
