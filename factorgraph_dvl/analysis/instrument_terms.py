@@ -88,6 +88,12 @@ class InstrumentTerms:
     alignment_std: Array
     axes: Array
 
+    @property
+    def attitude(self) -> Array:
+        """C_d^b, the attitude of the DVL in the vehicle, (3, 3), in forward, starboard, down."""
+        angles = self.dvl_in_body["ZYX"].value[::-1]
+        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+
 
 def has_instrument_terms(calibration: Calibration | Solution) -> bool:
     """Return whether a calibration is that of a DVL, with mounting, scale and lever arm."""

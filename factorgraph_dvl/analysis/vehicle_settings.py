@@ -114,18 +114,17 @@ def transform(i: InstrumentTerms) -> tuple[Array, Array]:
     With these axes for both, R = Rz(yaw) Ry(pitch) Rx(roll) takes components of the DVL to those
     of the vehicle (REP 103).
     """
-    angles = Rotation.from_matrix(_FLU @ _matrix(i) @ _FLU).as_euler("ZYX")[::-1]
+    angles = Rotation.from_matrix(_FLU @ i.attitude @ _FLU).as_euler("ZYX")[::-1]
     return _FLU @ i.lever_arm, angles
 
 
-def _matrix(i: InstrumentTerms) -> Array:
-    """Return C_d^b in forward, starboard, down."""
-    angles = i.dvl_in_body["ZYX"].value[::-1]
-    return Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
-
-
 def _looks_down(i: InstrumentTerms) -> bool:
-    return bool(_matrix(i)[2, 2] > np.cos(_SIDEWAYS * DEG))
+    return bool(i.attitude[2, 2] > np.cos(_SIDEWAYS * DEG))
+
+
+def _turn(yaw: float, since: float) -> float:
+    """Return the shorter turn from one angle to another, deg."""
+    return (yaw - since + 180.0) % 360.0 - 180.0
 
 
 def _frames(i: InstrumentTerms) -> tuple[str, str]:
@@ -186,8 +185,8 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
     if not _looks_down(i):
         yield f"VISO_ORIENT: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
-        nearest = min(_ROTATIONS, key=lambda angle: abs((yaw - angle + 180.0) % 360.0 - 180.0))
-        rest = (yaw - nearest + 180.0) % 360.0 - 180.0
+        nearest = min(_ROTATIONS, key=lambda angle: abs(_turn(yaw, angle)))
+        rest = _turn(yaw, nearest)
         yield Setting(f"VISO_ORIENT,{_ROTATIONS[nearest]}", (i.dvl_in_body["ZYX"].grade[2],))
         yield (
             f"VISO_ORIENT turns by 90 deg only. The rest is yaw {fixed(rest, 2)}, pitch "
@@ -229,7 +228,7 @@ def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Line
         yield f"mounting_rotation_offset: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
         offset = round(yaw) % 360
-        rest = (yaw - offset + 180.0) % 360.0 - 180.0
+        rest = _turn(yaw, offset)
         parameters = {"mounting_rotation_offset": offset}
         command = {"command": "set_config", "parameters": parameters}
         yield "Send this line to port 16171 of the DVL. Positive: clockwise from above."

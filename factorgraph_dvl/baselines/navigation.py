@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -102,10 +103,6 @@ class NavigationMotion:
         Local-level, as in `FilteredTrack`.
     covariance : ndarray, shape (M, 9, 9)
         Covariances of the errors of position, velocity, attitude.
-    v_b : ndarray, shape (M, 3), m/s
-        Velocity over the Earth in body.
-    v_b_covariance : ndarray, shape (M, 3, 3), m²/s²
-        Covariance of `v_b`.
     omega_b : ndarray, shape (M, 3), rad/s
         Rate relative to the Earth.
     omega_sigma : ndarray, shape (M, 3), rad/s
@@ -120,11 +117,21 @@ class NavigationMotion:
     velocity: Array
     nRb: Array
     covariance: Array
-    v_b: Array
-    v_b_covariance: Array
     omega_b: Array
     omega_sigma: Array
     covered: np.ndarray
+
+    @cached_property
+    def v_b(self) -> Array:
+        """Velocity over the Earth in body, (M, 3), m/s."""
+        return rotate(self.nRb.transpose(0, 2, 1), self.velocity)
+
+    @cached_property
+    def v_b_covariance(self) -> Array:
+        """Covariance of `v_b`, (M, 3, 3), m²/s²."""
+        bRn = self.nRb.transpose(0, 2, 1)
+        J = np.concatenate([bRn, bRn @ skew(self.velocity)], axis=2)
+        return np.asarray(J @ self.covariance[:, 3:, 3:] @ J.transpose(0, 2, 1))
 
 
 def navigate(trial: Trial, pings: Array, *, smoothed: bool = True) -> Navigation:
@@ -222,18 +229,14 @@ def motion_at(navigation: Navigation, time: Array) -> NavigationMotion:
 
     _, signal = at_times(samples, inside)
     bias = track.gyro_bias[before] + fraction[:, None] * np.diff(track.gyro_bias, axis=0)[before]
-    bRn = nRb.transpose(0, 2, 1)
-    v_b = rotate(bRn, velocity)
-    J = np.concatenate([bRn, bRn @ skew(velocity)], axis=2)
+    turning = rotate(nRb.transpose(0, 2, 1), earth_rate(geodetic[:, 0]))
     return NavigationMotion(
         time=time,
         geodetic=geodetic,
         velocity=velocity,
         nRb=nRb,
         covariance=P,
-        v_b=v_b,
-        v_b_covariance=J @ P[:, 3:, 3:] @ J.transpose(0, 2, 1),
-        omega_b=signal.omega - bias - rotate(bRn, _earth_rate(geodetic[:, 0])),
+        omega_b=signal.omega - bias - turning,
         omega_sigma=signal.omega_sigma,
         covered=covered,
     )
@@ -275,7 +278,8 @@ def _carry(track: FilteredTrack, index: np.ndarray, step: Steps) -> tuple[Array,
     return place, velocity, turned @ bias_turn @ step.turn
 
 
-def _earth_rate(lat: Array) -> Array:
+def earth_rate(lat: Array) -> Array:
+    """Return the Earth's rotation in east, north, up at latitudes (M,), rad, (M, 3), rad/s."""
     return RATE * np.stack([np.zeros_like(lat), np.cos(lat), np.sin(lat)], axis=1)
 
 

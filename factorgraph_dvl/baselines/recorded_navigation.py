@@ -11,7 +11,7 @@ from factorgraph_dvl.baselines.navigation import NavigationMotion
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
-from factorgraph_dvl.geometry.vectors import Array, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, longest_gap
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.gnss import Gnss
@@ -65,16 +65,12 @@ class RecordedNavigation:
         near = self.time[after] - self.time[after - 1] <= longest_gap(self.time)
         covered = (time == within) & near
         P = np.square(self.std[after])[:, :, None] * np.eye(9)
-        bRn = body.nRb.transpose(0, 2, 1)
-        J = np.concatenate([bRn, bRn @ skew(velocity)], axis=2)
         return NavigationMotion(
             time=time,
             geodetic=geodetic,
             velocity=velocity,
             nRb=body.nRb,
             covariance=P,
-            v_b=rotate(bRn, velocity),
-            v_b_covariance=J @ P[:, 3:, 3:] @ J.transpose(0, 2, 1),
             omega_b=body.omega_eb_b,
             omega_sigma=body.omega_sigma,
             covered=covered & self.attitude.covers(stamp),

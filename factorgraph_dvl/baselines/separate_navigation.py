@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from factorgraph_dvl.baselines.navigation import NavigationMotion
+from factorgraph_dvl.baselines.navigation import NavigationMotion, earth_rate
 from factorgraph_dvl.baselines.strapdown import at_times, compose, exp_small, prepare
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.earth import RATE, radii
+from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.rotations import rotation_from_rph, rph_jacobian
-from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate, skew
+from factorgraph_dvl.geometry.vectors import Array, interpolate, rotate
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.trial import Trial
@@ -59,22 +59,17 @@ def separate_motion(trial: Trial, time: Array) -> NavigationMotion:
         C = turn_of_n[k] @ C @ steps.turn[k]
         nRb[k] = C
     _, signal = at_times(samples, time)
-    bRn = nRb.transpose(0, 2, 1)
-    earth = np.column_stack([np.zeros_like(time), np.cos(place[:, 0]), np.sin(place[:, 0])])
-    omega_b = signal.omega - rotate(bRn, RATE * earth)
+    omega_b = signal.omega - rotate(nRb.transpose(0, 2, 1), earth_rate(place[:, 0]))
     velocity = antenna - _of_antenna(gnss, time, nRb, omega_b)
     covariance = np.zeros((time.size, 9, 9))
     covariance[:, [3, 4, 5], [3, 4, 5]] = variance
     covariance[:, 6:, 6:] = J @ np.diag(start.std**2) @ J.T
-    by_errors = np.concatenate([bRn, bRn @ skew(velocity)], axis=2)
     return NavigationMotion(
         time=time,
         geodetic=place,
         velocity=velocity,
         nRb=nRb,
         covariance=covariance,
-        v_b=rotate(bRn, velocity),
-        v_b_covariance=by_errors @ covariance[:, 3:, 3:] @ by_errors.transpose(0, 2, 1),
         omega_b=omega_b,
         omega_sigma=signal.omega_sigma,
         covered=np.ones(time.size, dtype=bool),
@@ -86,7 +81,7 @@ def _frame_rate(place: Array, velocity: Array) -> Array:
     lat, height = place[:, 0], place[:, 2]
     meridian, east = radii(lat)
     x, y = velocity[:, 0] / (east + height), velocity[:, 1] / (meridian + height)
-    return np.column_stack([-y, RATE * np.cos(lat) + x, RATE * np.sin(lat) + x * np.tan(lat)])
+    return earth_rate(lat) + np.column_stack([-y, x, x * np.tan(lat)])
 
 
 def _of_antenna(gnss: Gnss, time: Array, nRb: Array, omega: Array) -> Array:

@@ -30,6 +30,7 @@ from factorgraph_dvl.files.residual_table import (
 )
 from factorgraph_dvl.files.run_file import RUN_FILE
 from factorgraph_dvl.files.tables import read_header, read_table, release_memory, write_table
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.solution import Solution
@@ -52,11 +53,7 @@ CHECK_TABLE = "check.parquet"
 # Residuals of the DVL, and errors of dead reckoning, before and after calibration.
 CHECK_COLUMNS = (
     "time_s",
-    *(
-        f"residual_{axis}_{when}_m_s"
-        for when in ("before", "after")
-        for axis in ("forward", "starboard", "down")
-    ),
+    *(f"residual_{axis}_{when}_m_s" for when in ("before", "after") for axis in FRD_NAMES),
 )
 CHECK_ERRORS = ("track_error_before_m", "track_error_after_m")
 REPORT_FILE = "report.html"

@@ -27,6 +27,8 @@ _FRD_FROM_BODY: dict[str, Array] = {
     "FLU": np.diag([1.0, -1.0, -1.0]),
 }
 _ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+# Names of the axes that `frd_from_body` leads to.
+FRD_NAMES = ("forward", "starboard", "down")
 
 
 def frd_from_body(body_axes: BodyAxes) -> Array:

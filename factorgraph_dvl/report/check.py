@@ -22,7 +22,6 @@ POSITIONS = {
     "nothing": "No positions cover this time.",
 }
 ATTITUDE = "Attitude and velocity of the vehicle are those of the whole solution."
-AXES = ("forward", "starboard", "down")
 ERRORS = (
     ("end_point_error_m", "end point error, m"),
     ("end_point_percent", "end point error, % of distance"),

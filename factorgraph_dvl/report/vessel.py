@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.analysis.instrument_terms import ANTENNA, InstrumentTerms
 from factorgraph_dvl.geometry.rotations import frd_from_body
@@ -20,12 +19,16 @@ from factorgraph_dvl.solution import Solution
 _SLANT, _AZIMUTHS = 30.0, (45.0, 135.0, 225.0, 315.0)
 # Standard deviations of an ellipse.
 SIGMAS = 2.0
+# Chosen: a vessel is drawn at least so wide, m.
+_LEAST_M = 0.5
+# Seen length of an axis from which on it is drawn: another points nearly at the reader, and hides
+# behind its point.
+SHORTEST = 0.25
 # What is seen to the right and upward, of forward, starboard, down.
 VIEWS = {
     "From above": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]),
     "From the side, seen from starboard": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
 }
-AXES = ("forward", "starboard", "down")
 LEGEND = (
     "Arrows: axes of the DVL. Dashed: four beams at 30° from its axis.",
     "Ellipses: 2 σ, to scale, so that small ones hide behind their points.",
@@ -72,10 +75,23 @@ def places_of(
     ]
 
 
-def axes_of(terms: InstrumentTerms) -> Array:
-    """Return the axes of the DVL, (3, 3), a column each, in forward, starboard, down."""
-    angles = terms.dvl_in_body["ZYX"].value[::-1]
-    return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+def seen(view: Array, places: Sequence[Place]) -> tuple[Array, Array, float]:
+    """Return where places are seen in a view (2, 3): points (n, 2), their middle and span, m."""
+    points = np.stack([view @ p.place for p in places])
+    low, high = points.min(axis=0), points.max(axis=0)
+    return points, 0.5 * (low + high), max(float((high - low).max()), _LEAST_M)
+
+
+def ellipse(covariance: Array) -> tuple[float, float, float] | None:
+    """Return semi-axes for `SIGMAS` of a covariance (2, 2), m, and the angle of the longer, deg.
+
+    None where there is no uncertainty, or it is not known.
+    """
+    variance, turned = np.linalg.eigh(covariance)
+    if not np.isfinite(variance).all() or variance[1] <= 0.0:
+        return None
+    b, a = SIGMAS * np.sqrt(np.maximum(variance, 0.0))
+    return float(a), float(b), float(np.arctan2(turned[1, 1], turned[0, 1])) / DEG
 
 
 def beams() -> Iterator[Array]:

@@ -49,26 +49,19 @@ def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Fin
     P = found.covariances.information.covariance_of([alone, alone | by_error])
     std, relative_std = (float(x) for x in np.sqrt(np.diag(P)) / DEG)
     turn = in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value
+    angle, key, named = -float(down @ turn), "heading_error.about_the_vertical", {}
     if np.linalg.norm(turn) > _LARGE_DEG:
         # A component of a large rotation vector is no angle about its axis.
         axis, angle = foremost(values[_MISALIGNMENT] @ frd.T)
-        text = message(
-            "heading_error.bearing",
-            axis=axis,
-            angle=angle,
-            std=std,
-            relative=angle - mean / DEG,
-            relative_std=relative_std,
-        )
-    else:
-        angle = -float(down @ turn)
-        text = message(
-            "heading_error.about_the_vertical",
-            angle=angle,
-            std=std,
-            relative=angle - mean / DEG,
-            relative_std=relative_std,
-        )
+        key, named = "heading_error.bearing", {"axis": axis}
+    text = message(
+        key,
+        **named,
+        angle=angle,
+        std=std,
+        relative=angle - mean / DEG,
+        relative_std=relative_std,
+    )
     yield Finding(Code.HEADING_ERROR, text, parameter=_MISALIGNMENT)
 
 

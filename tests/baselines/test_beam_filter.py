@@ -33,7 +33,7 @@ def pings(count=200):
     P = np.broadcast_to(1e-8 * np.eye(9), (count, 9, 9))
     zero = np.zeros((count, 3))
     motion = NavigationMotion(
-        np.arange(float(count)), zero, v, eye, P, v, 1e-8 * eye, omega, zero, np.ones(count, bool)
+        np.arange(float(count)), zero, v, eye, P, omega, zero, np.ones(count, bool)
     )
     turns, scale, arm = np.split(TRUTH, [8, 12])
     at_dvl = v + np.cross(omega, arm)

@@ -92,9 +92,7 @@ def track(R, scale, arm, *, straight=False):
     geodetic = np.stack(frame.geodetic(position), axis=1)
     P = np.broadcast_to(1e-4 * np.eye(9), (time.size, 9, 9))
     zero = np.zeros((time.size, 3))
-    motion = NavigationMotion(
-        time, geodetic, v_n, nRb, P, v_b, P[:, :3, :3], zero, zero, np.ones(time.size, bool)
-    )
+    motion = NavigationMotion(time, geodetic, v_n, nRb, P, zero, zero, np.ones(time.size, bool))
     return motion, (1.0 + scale) * (v_b @ R.T)
 
 

@@ -8,13 +8,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import DARK, GREY, PALE, SMALL
-from factorgraph_dvl.report.vessel import AXES, SIGMAS, Place, beams
+from factorgraph_dvl.report.vessel import SHORTEST, Place, beams, ellipse, seen
 
-# Chosen: a vessel is drawn at least so wide, m; free space, axes and beams, as shares of that.
-_LEAST_M, _FREE, _AXIS, _BEAM = 0.5, 0.9, 0.3, 0.45
+# Chosen: free space, axes and beams, as shares of the width of a vessel.
+_FREE, _AXIS, _BEAM = 0.9, 0.3, 0.45
 _COLOURS = ("#b34700", "#00694b", "#332288")
 
 
@@ -40,10 +40,8 @@ def draw_vessel(
     said : callable, optional
         Translates names.
     """
-    points = np.stack([view @ p.place for p in places])
-    low, high = points.min(axis=0), points.max(axis=0)
-    span = max(float((high - low).max()), _LEAST_M)
-    middle, half = 0.5 * (low + high), (0.5 + _FREE) * span
+    points, middle, span = seen(view, places)
+    half = (0.5 + _FREE) * span
     box = ax.get_window_extent()
     wide = half * max(float(box.width / box.height), 1.0)
     tall = half * max(float(box.height / box.width), 1.0)
@@ -58,16 +56,16 @@ def draw_vessel(
     for beam in beams():
         ax.plot(*np.stack([at, at + _BEAM * span * (view @ axes @ beam)]).T, color=GREY, lw=0.8,
                 ls="--")  # fmt: skip
-    for k, (name, colour) in enumerate(zip(AXES, _COLOURS, strict=True)):
-        seen = view @ axes[:, k]
-        # An axis that points nearly at the reader hides behind its point.
-        if np.hypot(*seen) < 0.25:
+    for k, (name, colour) in enumerate(zip(FRD_NAMES, _COLOURS, strict=True)):
+        axis = view @ axes[:, k]
+        length = float(np.hypot(*axis))
+        if length < SHORTEST:
             continue
-        end = at + _AXIS * span * seen
+        end = at + _AXIS * span * axis
         ax.annotate("", end, at, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.3})
-        side = seen[0] / np.hypot(*seen)
+        side = axis[0] / length
         ax.annotate(
-            said(name), end, (6.0 * side, 6.0 * seen[1] / np.hypot(*seen)),
+            said(name), end, (6.0 * side, 6.0 * axis[1] / length),
             textcoords="offset points", color=colour, fontsize=SMALL, va="center",
             ha="left" if side > 0.5 else "right" if side < -0.5 else "center",
         )  # fmt: skip
@@ -89,11 +87,9 @@ def draw_vessel(
 
 
 def _draw_ellipse(ax: Axes, at: Array, covariance: Array) -> None:
-    variance, turned = np.linalg.eigh(covariance)
-    if not np.isfinite(variance).all() or variance[1] <= 0.0:
+    found = ellipse(covariance)
+    if found is None:
         return
-    b, a = 2.0 * SIGMAS * np.sqrt(np.maximum(variance, 0.0))
-    angle = float(np.arctan2(turned[1, 1], turned[0, 1])) / DEG
-    ax.add_patch(
-        Ellipse((float(at[0]), float(at[1])), a, b, angle=angle, fc="#0072b233", ec="#0072b2")
-    )
+    a, b, angle = found
+    place = (float(at[0]), float(at[1]))
+    ax.add_patch(Ellipse(place, 2.0 * a, 2.0 * b, angle=angle, fc="#0072b233", ec="#0072b2"))

@@ -8,10 +8,9 @@ import msgspec
 import numpy as np
 
 from factorgraph_dvl.analysis.dead_reckoning.check import Check
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.files.dead_reckoning import track_errors
-
-AXES = ("forward", "starboard", "down")
 
 
 def check_json(check: Check) -> bytes:
@@ -24,7 +23,7 @@ def check_json(check: Check) -> bytes:
         "to_s": float(check.time[-1]),
         "positions": tracks.scored_by,
         "residual_rms_m_s": {
-            "axes": AXES, "before": _rms(check.before), "after": _rms(check.after),
+            "axes": FRD_NAMES, "before": _rms(check.before), "after": _rms(check.after),
         },
         "dead_reckoning": {
             **track_errors(tracks.calibrated), "uncalibrated": track_errors(tracks.uncalibrated),
@@ -39,7 +38,7 @@ def check_columns(check: Check) -> dict[str, Array]:
     for when, residual in (("before", check.before), ("after", check.after)):
         columns |= {
             f"residual_{axis}_{when}_m_s": values
-            for axis, values in zip(AXES, residual.T, strict=True)
+            for axis, values in zip(FRD_NAMES, residual.T, strict=True)
         }
     for when, run in (("before", check.tracks.uncalibrated), ("after", check.tracks.calibrated)):
         if run.score is not None:
@@ -50,4 +49,8 @@ def check_columns(check: Check) -> dict[str, Array]:
 
 
 def _rms(residual: Array) -> list[Any]:
-    return np.sqrt(np.mean(residual**2, axis=0)).tolist() if residual.size else [None] * len(AXES)
+    return (
+        np.sqrt(np.mean(residual**2, axis=0)).tolist()
+        if residual.size
+        else [None] * len(FRD_NAMES)
+    )

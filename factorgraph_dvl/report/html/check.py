@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.report.check import (
-    AXES,
     TITLE,
     Row,
     check_rows,
@@ -35,8 +35,8 @@ def check_plots(result: Result) -> list[Plot]:
     time = columns["time_s"]
     plots = [
         Plot(
-            f"check-{when}", f"DVL residual {when} calibration", "m/s", AXES, time,
-            np.stack([columns[f"residual_{axis}_{when}_m_s"] for axis in AXES], axis=1),
+            f"check-{when}", f"DVL residual {when} calibration", "m/s", FRD_NAMES, time,
+            np.stack([columns[f"residual_{axis}_{when}_m_s"] for axis in FRD_NAMES], axis=1),
             axis="DVL residual",
         )
         for when in ("before", "after")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
-from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.html.markup import (
     Html,
@@ -21,14 +21,15 @@ from factorgraph_dvl.report.html.markup import (
     tspans,
 )
 from factorgraph_dvl.report.vessel import (
-    AXES,
     LEGEND,
+    SHORTEST,
     SIGMAS,
     VIEWS,
     Place,
-    axes_of,
     beams,
+    ellipse,
     places_of,
+    seen,
 )
 from factorgraph_dvl.solution import Solution
 
@@ -38,8 +39,8 @@ _SIZE, _MARGIN = 360.0, 124.0
 _AXIS, _BEAM = 54.0, 76.0
 # Points that are closer have one label, in units of the drawing.
 _APART = 16.0
-# Chosen: a vessel is drawn at least so wide, m, and an ellipse widens it at most so many times.
-_LEAST_M, _WIDEST = 0.5, 1.0
+# Chosen: an ellipse widens a vessel at most so many times.
+_WIDEST = 1.0
 
 
 def vessel_drawing(
@@ -56,7 +57,7 @@ def vessel_drawing(
     settings : mapping of str to object
         Settings of the trial, by section.
     """
-    places, axes = places_of(terms, solution, settings), axes_of(terms)
+    places, axes = places_of(terms, solution, settings), terms.attitude
     figures = [
         element("figure", _view(view, places, axes, title),
                 element("figcaption", both(title)))
@@ -75,9 +76,7 @@ def vessel_drawing(
 
 def _view(view: Array, places: Sequence[Place], axes: Array, title: str) -> Html:
     """Return a drawing of one view (2, 3): what is seen to the right, and upward."""
-    points = np.stack([view @ p.place for p in places])
-    low, high = points.min(axis=0), points.max(axis=0)
-    span = max(float((high - low).max()), _LEAST_M)
+    points, _, span = seen(view, places)
     spread = [np.sqrt(np.maximum(np.diag(view @ p.covariance @ view.T), 0.0)) for p in places]
     reach = np.minimum(SIGMAS * np.stack(spread), _WIDEST * span)
     low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
@@ -95,7 +94,7 @@ def _view(view: Array, places: Sequence[Place], axes: Array, title: str) -> Html
         f'<rect class="ground" width="{_SIZE:g}" height="{_SIZE:g}"/>',
         _bow(view),
         *(
-            _ellipse(xy, SIGMAS * scale, view @ p.covariance @ view.T)
+            _ellipse(xy, scale, view @ p.covariance @ view.T)
             for xy, p in zip(at, places, strict=True)
         ),
         f'<path class="arm" d="M{_xy(at[0])} L{_xy(at[-1])}"/>',
@@ -113,14 +112,13 @@ def _dvl(at: Array, view: Array, axes: Array) -> Iterator[str]:
     for beam in beams():
         end = at + _BEAM * (view @ axes @ beam) * [1.0, -1.0]
         yield f'<path class="beam" d="M{_xy(at)} L{_xy(end)}"/>'
-    for k, name in enumerate(AXES):
-        seen = (view @ axes[:, k]) * [1.0, -1.0]
-        length = float(np.hypot(*seen))
-        # An axis that points nearly at the reader hides behind its point.
-        if length < 0.25:
+    for k, name in enumerate(FRD_NAMES):
+        axis = (view @ axes[:, k]) * [1.0, -1.0]
+        length = float(np.hypot(*axis))
+        if length < SHORTEST:
             continue
-        end = at + _AXIS * seen
-        along, across = seen / length, np.array([-seen[1], seen[0]]) / length
+        end = at + _AXIS * axis
+        along, across = axis / length, np.array([-axis[1], axis[0]]) / length
         head = " L".join(_xy(end - 7.0 * along + side * across) for side in (-4.0, 4.0))
         yield f'<path class="axis{k}" d="M{_xy(at)} L{_xy(end)} M{_xy(end)} L{head} Z"/>'
         x, y = end + [6.0, 12.0] * along
@@ -155,14 +153,13 @@ def _names(at: Array, names: Sequence[str], free: Array) -> Iterator[str]:
 
 def _ellipse(at: Array, scale: float, covariance: Array) -> str:
     """Return an ellipse about a point, of a covariance (2, 2) seen to the right and upward."""
-    variance, turned = np.linalg.eigh(covariance)
-    if not np.isfinite(variance).all() or variance[1] <= 0.0:
+    found = ellipse(covariance)
+    if found is None:
         return ""
-    a, b = scale * np.sqrt(np.maximum(variance[::-1], 0.0))
-    angle = -np.arctan2(turned[1, 1], turned[0, 1]) / DEG
+    a, b, angle = found
     return (
-        f'<ellipse class="sigma" rx="{a:.2f}" ry="{b:.2f}" '
-        f'transform="translate({_xy(at)}) rotate({angle:.1f})"/>'
+        f'<ellipse class="sigma" rx="{scale * a:.2f}" ry="{scale * b:.2f}" '
+        f'transform="translate({_xy(at)}) rotate({-angle:.1f})"/>'
     )
 
 

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_pdf import PdfPages
 
 from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.texts import Language, component_names
@@ -25,7 +26,7 @@ from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.pdf.sheet import SMALL, TEXT, Sheet, fonts
 from factorgraph_dvl.report.table import Component, Table, plain
 from factorgraph_dvl.report.tables import FOR_EXPERTS, calibration_table
-from factorgraph_dvl.report.vessel import AXES, LEGEND, VIEWS, axes_of, places_of
+from factorgraph_dvl.report.vessel import LEGEND, VIEWS, places_of
 from factorgraph_dvl.solution import Solution
 
 # Reasons that are printed with what to do, and input files. Chosen: they fit on their pages.
@@ -94,7 +95,7 @@ def _first_page(sheet: Sheet, result: Result) -> None:
         sheet.space(0.25)
         drawings = sheet.axes(min(3.0, sheet.left - 0.9), 2, labels=0.55)
         for ax, (title, view) in zip(drawings, VIEWS.items(), strict=True):
-            draw_vessel(ax, view, places, axes_of(terms), sheet.said)
+            draw_vessel(ax, view, places, terms.attitude, sheet.said)
             ax.set_title(sheet.said(title), fontsize=TEXT, loc="left")
             for axis, seen in zip((ax.xaxis, ax.yaxis), view, strict=True):
                 _name_axis(axis, seen, sheet)
@@ -119,7 +120,7 @@ def _name_axis(axis: Axis, seen: Array, sheet: Sheet) -> None:
     """
     along = int(np.argmax(np.abs(seen)))
     sign = float(seen[along])
-    axis.set_label_text(f"{sheet.said(AXES[along])}, m", fontsize=SMALL)
+    axis.set_label_text(f"{sheet.said(FRD_NAMES[along])}, m", fontsize=SMALL)
     axis.set_major_formatter(lambda at, _: f"{sign * at + 0.0:.3g}".replace("-", "−"))
 
 
@@ -146,7 +147,7 @@ def _check_plots(sheet: Sheet, result: Result) -> None:
     label = sheet.said("time, s")
     sheet.space(0.25)
     for ax, when in zip(sheet.axes(1.35, 2), ("before", "after"), strict=True):
-        for axis, colour in zip(AXES, _COLOURS, strict=True):
+        for axis, colour in zip(FRD_NAMES, _COLOURS, strict=True):
             values = columns[f"residual_{axis}_{when}_m_s"]
             at, low, high = envelope(time, values)
             ax.fill_between(
