@@ -30,5 +30,11 @@ def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
     """Return the rows of several such data classes as one."""
     first = parts[0]
     return type(first)(
-        **{name: np.concatenate([vars(p)[name] for p in parts]) for name in vars(first)}
+        **{name: _joined([vars(p)[name] for p in parts]) for name in vars(first)}
     )
+
+
+def _joined(parts: Sequence[Any]) -> Any:
+    if parts[0] is None:
+        return None
+    return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else concatenated(parts)

@@ -67,6 +67,21 @@ def exp_so3(phi: ArrayLike) -> Array:
     )
 
 
+def cumulative_products(matrices: Array) -> Array:
+    """Return the products M_0 M_1 … M_i of matrices (N, 3, 3) up to each."""
+    count = len(matrices)
+    size = max(int(np.sqrt(count)), 1)
+    runs = -(-count // size)
+    out = np.tile(IDENTITY, (runs * size, 1, 1))
+    out[:count] = matrices
+    out = out.reshape(runs, size, 3, 3)
+    for i in range(1, size):
+        out[:, i] = out[:, i - 1] @ out[:, i]
+    for k in range(1, runs):
+        out[k] = out[k - 1, -1] @ out[k]
+    return np.asarray(out.reshape(-1, 3, 3)[:count])
+
+
 def log_so3(matrix: ArrayLike) -> Array:
     """Return the rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3)."""
     matrix = np.asarray(matrix, dtype=float)

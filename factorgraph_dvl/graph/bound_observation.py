@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.clocks import linearized, parameters_of, time_on_chai
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.imu.window_means import by_motion_in_the_middle
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
@@ -80,6 +81,8 @@ class BoundObservation:
         When the offsets of clocks hold.
     errors : ImuErrors, optional
         Errors of the IMU that are estimated.
+    averages : bool, default False
+        Whether the length of the window over which it averages is estimated.
     """
 
     observation: Observation
@@ -89,6 +92,7 @@ class BoundObservation:
     weight: Array
     clock_zero: float
     errors: ImuErrors | None = None
+    averages: bool = False
 
     def __post_init__(self) -> None:
         # Until it is known that it does not.
@@ -148,8 +152,19 @@ class BoundObservation:
         """Return where measurements hang on the chain by clocks as they are."""
         shift = self.chain.shift(parameters)
         return self.chain.attach(
-            self.times(parameters), shift, turning=self.turning, before=self.attachment
+            self.times(parameters),
+            shift,
+            turning=self.turning,
+            before=self.attachment,
+            window=self.window(parameters),
         )
+
+    def window(self, parameters: Mapping[str, Array]) -> float | None:
+        """Return the length of the window that measurements are means over, s; None = of none."""
+        name = self.observation.averaging
+        if name is None or not (self.averages or parameters[name].any()):
+            return None
+        return float(parameters[name][0])
 
     def attach(self, parameters: Mapping[str, Array]) -> None:
         """Attach measurements to the chain by clocks as they are."""
@@ -257,18 +272,19 @@ class BoundObservation:
         transitions : dict
             To times of a motion, by its identity and which they are: kept for other observations.
         """
-        lin, when = lin.some(some), self.observation.time[some]
+        here = rows_of(motion, some)
+        lin, when = by_motion_in_the_middle(lin.some(some), here), self.observation.time[some]
         at, errors = rows_of(self.attachment, some), self.errors
         by = None if errors is None else rows_of(errors.sensitivity(self.attachment), some)
-        here = (
+        which = (
             id(motion),
             some.tobytes() if isinstance(some, np.ndarray) else (some.start, some.stop),
         )
-        if here not in transitions:
+        if which not in transitions:
             if errors is not None and by is not None:
                 at = errors.without(at, by, errors.vector(parameters))
-            transitions[here] = self.chain.transition(at, states, rows_of(motion, some))
-        transition = transitions[here]
+            transitions[which] = self.chain.transition(at, states, here)
+        transition = transitions[which]
         found = dict(lin.d_parameters)
         if errors is not None and by is not None:
             found |= errors.columns(lin, transition, by, errors.vector(parameters))

@@ -196,7 +196,13 @@ class Chain(Protocol):
         """Whether the motion is known at times (M,)."""
 
     def attach(
-        self, time: Array, shift: float = 0.0, *, turning: bool = False, before: Any = None
+        self,
+        time: Array,
+        shift: float = 0.0,
+        *,
+        turning: bool = False,
+        before: Any = None,
+        window: float | None = None,
     ) -> Any:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest.
 
@@ -211,6 +217,9 @@ class Chain(Protocol):
             attitude do, and those that move with the nodes.
         before : object, optional
             Where they hung.
+        window : float, optional, s
+            Length of windows about the times, of measurements that are means; a chain without
+            samples knows the motion at the times only.
         """
 
     def missing(self, at: Any, lin: Linearization) -> Array | None:

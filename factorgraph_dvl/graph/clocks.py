@@ -17,8 +17,9 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 
 def parameters_of(observation: Observation) -> tuple[str, ...]:
     """Return the names of all parameters of a measurement, those of its clock included."""
-    clock = observation.clock
-    return observation.parameters if clock is None else (*observation.parameters, *clock.names)
+    clock, averaging = observation.clock, observation.averaging
+    own = () if clock is None else clock.names
+    return (*observation.parameters, *own, *(() if averaging is None else (averaging,)))
 
 
 def true_time(observation: Observation, values: Mapping[str, Array], zero: float) -> Array:
@@ -68,7 +69,7 @@ def linearized(
     clock: str | None = None,
     attitude_clock: str | None = None,
 ) -> Linearization:
-    """Return residual and Jacobians of measurements, those of their clock included.
+    """Return residual and Jacobians of measurements, those of clock and window included.
 
     With the lag o + r (t - t0) of the stamps,
 
@@ -95,14 +96,15 @@ def linearized(
         The same of their attitudes and rates; None = that of the nodes.
     """
     lin = observation.linearize(motion, values, wanted)
+    averaging = observation.averaging
     own = () if observation.clock is None else observation.clock.names
-    if not {*own, clock, attitude_clock} & {*wanted}:
+    if not {*own, averaging, clock, attitude_clock} & {*wanted}:
         return lin
 
-    def by_change(*of: tuple[Array | None, Array]) -> Array:
+    def by_change(*of: tuple[Array | None, Array | None]) -> Array:
         out = np.zeros((*lin.residual.shape, 1))
         for jacobian, change in of:
-            if jacobian is not None:
+            if jacobian is not None and change is not None:
                 out += jacobian @ change[:, :, None]
         return out
 
@@ -113,6 +115,10 @@ def linearized(
     moving = by_change((lin.d_p, move), (lin.d_v, motion.a_n))
     by_time = turning + moving
     found = dict(lin.d_parameters)
+    if averaging is not None and averaging in wanted:
+        found[averaging] = by_change(
+            (lin.d_v, motion.v_by_length), (lin.d_omega, motion.omega_by_length)
+        )
     since = (observation.time - zero)[:, None, None]
     for name, by in zip(own, (-by_time, -by_time * since), strict=False):
         if name in wanted:

@@ -246,9 +246,10 @@ class InertialChain:
         *,
         turning: bool = False,
         before: TwoWay | None = None,
+        window: float | None = None,
     ) -> TwoWay:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
-        return attach_two_way(self.segments, time, self.frame.earth_rate)
+        return attach_two_way(self.segments, time, self.frame.earth_rate, window)
 
     def missing(self, at: TwoWay, lin: Linearization) -> Array | None:
         """Return the variance (M, d) that noise of the IMU leaves of what is predicted.

@@ -55,6 +55,11 @@ class ObservationRows:
         return self.whole.time[self.index]
 
     @property
+    def averaging(self) -> str | None:
+        """Name of the length of the window over which it averages."""
+        return self.whole.averaging
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the calibration parameters that it depends on."""
         return self.whole.parameters

@@ -283,6 +283,7 @@ class PlanarChain:
         *,
         turning: bool = False,
         before: Attached | None = None,
+        window: float | None = None,
     ) -> Attached:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         time = np.clip(time, self.node_time[0], self.node_time[-1])

@@ -380,7 +380,8 @@ class Problem:
         found: dict[Hashable, Any] = {}
         out = []
         for bound in self._bound:
-            own = (bound.turning, shift, bound.times(parameters).tobytes())
+            window = bound.window(parameters)
+            own = (bound.turning, shift, bound.times(parameters).tobytes(), window)
             if own not in found:
                 at = self._attachments.get(own)
                 found[own] = bound.attached(parameters) if at is None else at
@@ -752,7 +753,10 @@ class Problem:
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        return BoundObservation(observation, self.chain, None, covered, weight, self.clock_zero)
+        averages = observation.averaging in self._key
+        return BoundObservation(
+            observation, self.chain, None, covered, weight, self.clock_zero, averages=averages
+        )
 
     def _lay_out(self, block: _Block) -> None:
         """Make a block's factors for the nodes that its measurements depend on."""

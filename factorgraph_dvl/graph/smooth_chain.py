@@ -270,6 +270,7 @@ class SmoothChain:
         *,
         turning: bool = False,
         before: Attached | None = None,
+        window: float | None = None,
     ) -> Attached:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest.
 

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import rows_of
-from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
+from factorgraph_dvl.geometry.rotations import cumulative_products, exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
 from factorgraph_dvl.imu.increments import Increments, increments
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
@@ -474,12 +474,7 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
     inside = np.arange(first, last)
     phi, dv = inc.over(inside)
     turn, left = _turns(phi)
-    dR = np.concatenate([IDENTITY[None], turn[:-1]])
-    # Products of all up to each: of runs that become twice as long.
-    run = 1
-    while run < inside.size:
-        dR[run:] = dR[:-run] @ dR[run:]
-        run *= 2
+    dR = cumulative_products(np.concatenate([IDENTITY[None], turn[:-1]]))
     dt = inc.dt[inside, None]
     turned = rotate(dR, dv)
     dV, dP = np.zeros((2, inside.size, 3))

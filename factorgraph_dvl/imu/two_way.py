@@ -25,8 +25,10 @@ from factorgraph_dvl.imu.propagation import (
     States,
     Transition,
     attach_smoothly,
+    averaged_motion,
     extrapolated,
     motion_at,
+    with_windows,
 )
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
@@ -86,21 +88,35 @@ class TwoWayTransition:
     backward: Transition
 
 
-def attach_two_way(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
+def attach_two_way(
+    seg: Segments, time: Array, earth_rate_n: Array, window: float | None = None
+) -> TwoWay:
     """Attach times (M,) to both nodes of their segments; those not covered, where nearest.
 
     Times that something is still attached to are not attached anew.
+
+    Parameters
+    ----------
+    seg : Segments
+        Increments between the nodes.
+    time : ndarray, shape (M,), s
+        Times.
+    earth_rate_n : ndarray, shape (3,), rad/s
+        Earth rate in n.
+    window : float, optional, s
+        Length of the windows about the times, of measurements that are means.
     """
     known = vars(seg).setdefault("_attached", WeakValueDictionary())
-    key = time.tobytes(), earth_rate_n.tobytes()
+    key = time.tobytes(), earth_rate_n.tobytes(), window
     found = known.get(key)
     if found is None:
-        found = known[key] = _attached(seg, time, earth_rate_n)
+        found = known[key] = _attached(seg, time, earth_rate_n, window)
     return found
 
 
-def _attached(seg: Segments, time: Array, earth_rate_n: Array) -> TwoWay:
+def _attached(seg: Segments, time: Array, earth_rate_n: Array, window: float | None) -> TwoWay:
     forward, beyond = attach_smoothly(seg, time, earth_rate_n)
+    forward = with_windows(seg, forward, time, window)
     span = seg.duration[forward.segment]
     u = np.clip(forward.tau / span, 0.0, 1.0)
     tau = forward.tau - span
@@ -162,7 +178,7 @@ def motion_two_way(at: TwoWay, states: States, gravity_n: Array, earth_rate_n: A
         turning_b=rate * turn,
         moving_n=rate * shift,
     )
-    return extrapolated(blended, at.beyond)
+    return averaged_motion(extrapolated(blended, at.beyond), at.forward, gravity_n)
 
 
 def transition_two_way(

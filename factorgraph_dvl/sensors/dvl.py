@@ -52,6 +52,10 @@ LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 # Plausible size, m/s. Chosen: ten times the bias of a DVL that is in order.
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
+# Plausible length, s. Chosen: what DVLs average over where nothing else is set.
+AVERAGING_SPEC = ParameterSpec(
+    "averaging", "s", labels=SCALAR, nuisance=True, plausible=0.3, usual=True
+)
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
@@ -60,6 +64,7 @@ LEVER_ARM = LEVER_ARM_SPEC.name
 BIAS = BIAS_SPEC.name
 TIME_OFFSET = CLOCK.offset.name
 CURRENT = CURRENT_SPEC.name
+AVERAGING = AVERAGING_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.
 CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
@@ -93,6 +98,9 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
     bias_std_m_s: Sigma3 = (0.001, 0.001, 0.001)
     time_offset_std_s: NonNegative = 0.5
+    averaging_s: NonNegative = 0.0
+    averaging_std_s: NonNegative | UnsetType = UNSET
+    stamp: Literal["start", "middle", "end"] = "middle"
     correlation_time_s: Positive | UnsetType = UNSET
     correlated_std_m_s: float | Sigma3 | UnsetType = UNSET
     scale_walk_std_sqrt_h: NonNegative = 0.0
@@ -101,6 +109,11 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     # Of the current as a process about its mean; estimated where they are not stated.
     current_variation_std_m_s: NonNegative | UnsetType = UNSET
     current_correlation_time_s: Positive | UnsetType = UNSET
+
+    @property
+    def middle(self) -> float:
+        """How much later than its stamp the middle of the window is, s."""
+        return {"start": 0.5, "middle": 0.0, "end": -0.5}[self.stamp] * self.averaging_s
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -159,7 +172,7 @@ class Dvl:
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
         *(MISALIGNMENT_SPEC, SCALE_SPEC, SCALES_SPEC, LEVER_ARM_SPEC),
-        *(BIAS_SPEC, *CLOCK.specs, CURRENT_SPEC),
+        *(BIAS_SPEC, *CLOCK.specs, AVERAGING_SPEC, CURRENT_SPEC),
     )
 
     def __post_init__(self) -> None:
@@ -257,6 +270,7 @@ class Dvl:
             Parameter(LEVER_ARM_SPEC, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
             Parameter(BIAS_SPEC, np.zeros(3), np.array(s.bias_std_m_s)),
             *CLOCK.parameters(s),
+            averaging(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
 
@@ -269,7 +283,7 @@ class Dvl:
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
         s = self.settings
         correlated = expected_correlation(s.correlation_time_s, s.correlated_std_m_s, 3)
-        time, velocity = self.time[m], self.velocity[m]
+        time, velocity = self.time[m] + s.middle, self.velocity[m]
         rate = s.scale_walk_std_sqrt_h / np.sqrt(HOUR)
         walk = ScaleWalk(SCALE_ERROR, rate, time, velocity) if rate > 0.0 else None
         return (
@@ -345,6 +359,7 @@ class DvlVelocity(ObservationByRows):
         CURRENT,
     )
     clock: Clock = CLOCK
+    averaging: str | None = AVERAGING
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
@@ -391,6 +406,13 @@ class DvlVelocity(ObservationByRows):
             d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
             d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
         )
+
+
+def averaging(spec: ParameterSpec, length: float, std: float | UnsetType) -> Parameter:
+    """Return the length of a window; it is known for certain where its deviation is stated as 0."""
+    if isinstance(std, UnsetType):
+        return Parameter(spec, np.array([length]), np.zeros(1))
+    return Parameter(replace(spec, plausible=None), np.array([length]), np.array([std]))
 
 
 def _scale_spec(axes: int) -> ParameterSpec:

@@ -77,6 +77,8 @@ class ParameterSpec:
     plausible : float, optional
         Standard deviation of values that there can be, in `unit`. Where a trial states that the
         parameter is known, tests ask whether another value would explain a misfit.
+    usual : bool, default False
+        Whether most sensors have it although trials do not state it: a length, above zero.
     """
 
     stem: str
@@ -89,6 +91,7 @@ class ParameterSpec:
     above: float = -math.inf
     nuisance: bool = False
     plausible: float | None = None
+    usual: bool = False
 
     @cached_property
     def name(self) -> str:

@@ -49,6 +49,11 @@ class Motion:
     turning_b, moving_n : ndarray, shape (M, 3), optional
         Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
         and m/s: where two motions that differ are blended.
+    v_by_v, v_by_theta : ndarray, shape (M, 3, 3), optional
+        Of velocity and rate that are means over windows: derivatives of v_n by the velocity and by
+        the attitude in their middles.
+    v_by_length, omega_by_length : ndarray, shape (M, 3), optional
+        Likewise derivatives of v_n and omega_eb_b by the length of the windows.
     """
 
     nRb: Array
@@ -60,6 +65,10 @@ class Motion:
     omega_sigma: Array
     turning_b: Array | None = None
     moving_n: Array | None = None
+    v_by_v: Array | None = None
+    v_by_theta: Array | None = None
+    v_by_length: Array | None = None
+    omega_by_length: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -237,6 +246,10 @@ class Observation(Protocol):
     def clock(self) -> SensorClock | None:
         """Clock of the sensor; None = that of the IMU."""
 
+    @property
+    def averaging(self) -> str | None:
+        """Name of the length of the window over which it averages; None = it does not."""
+
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the (M, d) standard deviations of the residual.
 
@@ -262,6 +275,7 @@ class PlainObservation:
     correlated: ExpectedCorrelation | None = None
     scale_walk: ScaleWalk | None = None
     independent: bool = False
+    averaging: str | None = None
 
 
 class ObservationByRows(PlainObservation):

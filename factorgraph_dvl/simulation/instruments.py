@@ -248,6 +248,7 @@ class DvlTruth(ClockedInstrument, frozen=True, kw_only=True):
     correlation_time_s: Positive = 5.0
     scale_drift: float = 0.0
     scale_walk_sqrt_h: NonNegative = 0.0
+    averaging_s: NonNegative = 0.0
     outliers: Outliers | None = None
     false_lock: FalseLock | None = None
     reference: Literal["bottom", "water"] = "bottom"

@@ -144,14 +144,16 @@ def simulate_dvl(
 
         v_d = (1 + k) C_b^d (v_b + omega_eb_b x l) + noise,
 
-    at the true time of the ping. Through the water, v_b excludes the current.
+    at the true time of the ping, or its mean over a window with the ping in the middle. Through
+    the water, v_b excludes the current.
     """
     truth: DvlTruth = scenario.dvl
     jitter_rng, noise_rng, water_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
-    state = motion.at(time)
-    water = _water(scenario, time, state, water_rng)
-    velocity = _dvl_velocity(scenario, state, water)
+    half = 0.5 * truth.averaging_s
+    time = time[(time >= half) & (time <= motion.duration - half)]
+    water = _water(scenario, time, motion.at(time), water_rng)
+    velocity = _mean_dvl_velocity(scenario, motion, time, water)
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
@@ -170,6 +172,7 @@ def simulate_dvl(
         "lever_arm_m": np.array(truth.lever_arm_m),
         "dvl_bias_m_s": np.zeros(3),
         "time_offset_s": np.zeros(1),
+        "averaging_s": np.array([truth.averaging_s]),
     }
     if truth.reference == "water":
         calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
@@ -240,6 +243,23 @@ def moving_water(
     )
     beyond = draws - walk[knots]
     return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
+
+
+def _mean_dvl_velocity(
+    scenario: ScenarioView, motion: TrueMotion, time: Array, water: Array
+) -> Array:
+    """Return means of the DVL's velocity over windows about times (M,), by Gauss and Legendre."""
+    length = scenario.dvl.averaging_s
+    if length == 0.0:
+        return _dvl_velocity(scenario, motion.at(time), water)
+    points, weights = np.polynomial.legendre.leggauss(
+        _quadrature_order(motion.highest_rate() * length)
+    )
+    out = np.zeros((time.size, 3))
+    for point, weight in zip(points, weights, strict=True):
+        inside = np.clip(time + 0.5 * length * point, 0.0, motion.duration)
+        out += 0.5 * weight * _dvl_velocity(scenario, motion.at(inside), water)
+    return out
 
 
 def _dvl_velocity(scenario: ScenarioView, state: TrueState, current: Array) -> Array:

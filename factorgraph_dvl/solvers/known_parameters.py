@@ -166,7 +166,7 @@ def _tests(
     known = [
         p
         for p in problem.all_parameters
-        if not p.estimated and p.spec.plausible is not None and p.name in used
+        if not (p.estimated or p.spec.plausible is None or p.spec.usual) and p.name in used
     ]
     out = _tests_of_priors(problem, evaluation, information)
     free = [*(p for p, _ in out.values()), *known]

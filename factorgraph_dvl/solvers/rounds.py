@@ -25,6 +25,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.solvers.steps import (
+    Averaging,
     Correlation,
     Gates,
     GrossErrors,
@@ -105,7 +106,7 @@ def settle(
     known = KnownParameters()
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Gates(), GrossErrors(), Correlation(), known, Noise(),
+        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known, Noise(),
         ImuNoise(), Uncorrelated(), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True

@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
@@ -29,7 +30,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     with_others,
 )
 from factorgraph_dvl.solvers.imu_noise import lower_noise
-from factorgraph_dvl.solvers.known_parameters import Explanation, explanation
+from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated, Model
 from factorgraph_dvl.solvers.motion_strengths import Strengths
@@ -156,6 +157,26 @@ class Gates:
         found: Mapping[str, Array] = at.problem.outliers(at.minimum.evaluation)
         if not _same(found, at.model.rejected):
             yield _from(at, rejected=found)
+
+
+@dataclass
+class Averaging:
+    """Sensors that are stated to measure in no time: whether they average over a window."""
+
+    name = "averaging"
+    _tested: bool = False
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what estimates the length of a window, where the data show one."""
+        if self._tested or at.rough or at.problem.chain.interpolates:
+            return
+        self._tested = True
+        found = shown_windows(at.problem, at.minimum)
+        if not found:
+            return
+        free = {p.name: wide(p, p.mean) for p in found}
+        parameters = tuple(free.get(p.name, p) for p in at.model.parameters)
+        yield _from(at, parameters=parameters)
 
 
 @dataclass

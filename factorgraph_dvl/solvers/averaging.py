@@ -1,0 +1,72 @@
+"""Sensors that average over a window although they are stated to measure in no time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+
+# χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
+# twenty is beyond, and loses some precision; one that does is left with less than two standard
+# deviations.
+_SHOWN = 2.7
+
+
+def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
+    """Return the lengths of windows that are taken as known and that the data contradict.
+
+    Parameters
+    ----------
+    problem, minimum : Problem or Minimum
+        At its minimum.
+    """
+    known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.usual}
+    out = []
+    for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
+        p = known.get(bound.observation.averaging or "")
+        if p is not None and bound.weight.any():
+            if _chi_square(problem, bound, minimum, residual) > _SHOWN:
+                out.append(p)
+    return tuple(out)
+
+
+def _chi_square(
+    problem: Problem, bound: BoundObservation, minimum: Minimum, residual: Array
+) -> float:
+    """Return twice the fall of the cost by a longer window, as residuals scatter.
+
+    With j the whitened derivatives by the length, A those by all variables and P the covariance of
+    these, (jᵀr)² / (jᵀj - jᵀA P Aᵀj): the score test of `statistics.scores`, of one parameter.
+    """
+    evaluation = minimum.evaluation
+    values, name = evaluation.parameters, str(bound.observation.averaging)
+    window = replace(bound, averages=True)
+    motion = window.motion(window.attached(values), evaluation.states, values)
+    lin = window.linearized(motion, values, [name], problem.processes_of(bound))
+    column = bound.weight * lin.d_parameters[name][:, :, 0]
+    score = -float(np.vdot(column, residual))
+    if score <= 0.0:
+        return 0.0
+    information = minimum.square_root or factorized(problem, evaluation)[0]
+    taken_up: dict[int, Array] = {}
+    for rows in problem.observation_rows(evaluation):
+        if rows.source != bound.observation.label:
+            continue
+        some = column[rows.begin : rows.begin + len(rows.matrix)]
+        by_variables = np.einsum("md,mdn->mn", some, rows.matrix)
+        edges = np.cumsum([0, *rows.sizes])
+        for keys, a, b in zip(rows.keys.T, edges, edges[1:], strict=False):
+            different, place = np.unique(keys, return_inverse=True)
+            sums = np.zeros((different.size, b - a))
+            np.add.at(sums, place, by_variables[:, a:b])
+            for key, own in zip(different.tolist(), sums, strict=True):
+                taken_up[key] = taken_up.get(key, 0.0) + own[None]
+    left = float(np.vdot(column, column)) - float(information.covariance_of([taken_up])[0, 0])
+    scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
+    return score**2 / left / scatter if left > 0.0 else 0.0
