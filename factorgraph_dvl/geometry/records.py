@@ -29,9 +29,7 @@ def _rows(values: Any, rows: slice | IntArray | BoolArray) -> Any:
 def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
     """Return the rows of several such data classes as one."""
     first = parts[0]
-    return type(first)(
-        **{name: _joined([vars(p)[name] for p in parts]) for name in vars(first)}
-    )
+    return type(first)(**{name: _joined([vars(p)[name] for p in parts]) for name in vars(first)})
 
 
 def _joined(parts: Sequence[Any]) -> Any:

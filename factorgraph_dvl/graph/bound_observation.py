@@ -22,7 +22,12 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.window_means import by_motion_in_the_middle
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    Observation,
+    ObservationByRows,
+)
 
 # Unit of the residuals of attitudes.
 _ANGLE = "rad"

@@ -108,9 +108,7 @@ def linearized(
                 out += jacobian @ change[:, :, None]
         return out
 
-    turn, move = motion.omega_eb_b, motion.v_n
-    if motion.turning_b is not None and motion.moving_n is not None:
-        turn, move = turn + motion.turning_b, move + motion.moving_n
+    turn, move = motion.changes
     turning = by_change((lin.d_theta, turn), (lin.d_omega, motion.alpha_b))
     moving = by_change((lin.d_p, move), (lin.d_v, motion.a_n))
     by_time = turning + moving

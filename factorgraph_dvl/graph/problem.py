@@ -748,12 +748,16 @@ class Problem:
         """Tie an observation to the chain."""
         time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
         covered = self.chain.covers(time)
+        name = observation.averaging
+        if name is not None and self.bound_at[name].any():
+            half = 0.5 * abs(float(self.bound_at[name][0]))
+            covered = covered & self.chain.covers(time - half) & self.chain.covers(time + half)
         if usable is not None:
             covered = covered & usable
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        averages = observation.averaging in self._key
+        averages = name in self._key
         return BoundObservation(
             observation, self.chain, None, covered, weight, self.clock_zero, averages=averages
         )

@@ -137,14 +137,12 @@ def attach_inside(
     return attach(seg, np.where(covered, time, nearest), earth_rate_n), covered
 
 
-def with_windows(seg: Segments, at: Attachment, time: Array, length: float | None) -> Attachment:
+def with_windows(seg: Segments, at: Attachment, time: Array, window: float | None) -> Attachment:
     """Return an attachment with windows of a length about its times (M,); None = without."""
-    if length is None:
+    if window is None:
         return at
-    found = windows(seg.increments, time, length)
-    return replace(
-        at, windows=found, alpha_sigma=found.slope_sigma, force_sigma=found.force_sigma
-    )
+    found = windows(seg.increments, time, window)
+    return replace(at, windows=found, alpha_sigma=found.slope_sigma, force_sigma=found.force_sigma)
 
 
 def segment_ends(seg: Segments, earth_rate_n: Array, *, rates: bool = True) -> Attachment:

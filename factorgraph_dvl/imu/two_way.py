@@ -104,7 +104,7 @@ def attach_two_way(
     earth_rate_n : ndarray, shape (3,), rad/s
         Earth rate in n.
     window : float, optional, s
-        Length of the windows about the times, of measurements that are means.
+        Length of windows about the times, of measurements that are means.
     """
     known = vars(seg).setdefault("_attached", WeakValueDictionary())
     key = time.tobytes(), earth_rate_n.tobytes(), window

@@ -254,11 +254,17 @@ def _before(steps: Array) -> Array:
     return out
 
 
+def _per_second(values: Array, half: Array) -> Array:
+    """Return values (M, ...) by the lengths of windows of some halves."""
+    return values / (2.0 * half).reshape(-1, *[1] * (values.ndim - 1))
+
+
 def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Windows:
     """Return windows about points of a run from one end to the other."""
     one, other = ends
     length = 2.0 * half
     here = now.signals.omega
+    step = float(np.mean(run.inc.dt))
 
     def per_second(values: Array) -> Array:
         return values / length.reshape(-1, *[1] * (values.ndim - 1))
@@ -266,10 +272,23 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Win
     back, moment, moved, angle = (
         per_second(b - a) for a, b in zip(one.integrals, other.integrals, strict=True)
     )
+    # Chords of angle and velocity within intervals are too short by h²/12 of the change of their
+    # slopes, which adds up to that from end to end.
+    bRn = now.dR.transpose(0, 2, 1)
+    turned, pushed = (
+        per_second(rotate(bRn, rotate(other.dR, after) - rotate(one.dR, before))) * step**2 / 12.0
+        for before, after in (
+            (one.signals.omega, other.signals.omega),
+            (one.signals.force, other.signals.force),
+        )
+    )
     # By the axes and the time in the middle what is by those at the start of the run.
     about = moment - now.time[:, None, None] * back
     mean = BodyMotion(
-        back @ now.dR, about @ now.dR, moved - rotate(back, now.dV), angle - here
+        back @ now.dR + skew(turned),
+        about @ now.dR,
+        moved - rotate(back, now.dV) - pushed,
+        angle - here,
     )
 
     def at_end(end: _Point, sign: float) -> BodyMotion:
@@ -279,18 +298,19 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Win
         return BodyMotion(turn, swept, added, end.signals.omega - here)
 
     before, after = at_end(one, -1.0), at_end(other, 1.0)
-    of_ends = before.plus(after, 0.5, 0.5)
-    change, lengthened = after.plus(before, -1.0), of_ends.plus(mean, -1.0)
-    gyro, accel = (
-        sigma * np.sqrt(float(np.mean(run.inc.dt)))
-        for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma)
-    )
-    turned = np.broadcast_to(IDENTITY, back.shape)
+    change = after.plus(before, -1.0)
+    lengthened = before.plus(after, 0.5, 0.5).plus(mean, -1.0)
+    gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
     return Windows(
         mean,
         BodyMotion(*(per_second(each) for each in vars(change).values())),
         BodyMotion(*(per_second(each) for each in vars(lengthened).values())),
-        BodyMotion(-skew(here), turned, now.signals.force, now.signals.alpha),
+        BodyMotion(
+            -skew(here),
+            np.broadcast_to(IDENTITY, back.shape),
+            now.signals.force,
+            now.signals.alpha,
+        ),
         gyro / np.sqrt(length),
         np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length,
         accel / np.sqrt(length),
@@ -314,19 +334,20 @@ def averaged(motion: Motion, over: Windows, gravity_n: Array) -> Motion:
     v_b, gravity_b = rotate(bRn, motion.v_n), rotate(bRn, gravity_n)
     mean_b = over.mean.velocity(v_b, gravity_b)
     by_length = over.by_length.velocity(v_b, gravity_b)
-    rate = motion.omega_eb_b if motion.turning_b is None else motion.omega_eb_b + motion.turning_b
+    rate, move = motion.changes
     # What moves the middle beside the samples: biases, and nodes between which it is blended.
     beside = rotate(bRn, motion.a_n) - cross(rate, v_b) - over.slope.velocity(v_b, gravity_b)
     by_time = over.by_time.velocity(v_b, gravity_b) + rotate(over.mean.turn, beside)
-    turning = rate + over.mean.rate
     by_attitude = over.mean.turn @ skew(v_b) + over.mean.swept @ skew(gravity_b) - skew(mean_b)
     return replace(
         motion,
         v_n=rotate(R, mean_b),
         omega_eb_b=motion.omega_eb_b + over.mean.rate,
-        a_n=rotate(R, cross(turning, mean_b) + by_time),
+        a_n=rotate(R, cross(rate, mean_b) + by_time),
         alpha_b=over.by_time.rate,
         omega_sigma=np.repeat(over.rate_sigma[:, None], 3, axis=1),
+        turn_rate_b=rate,
+        move_rate_n=move,
         v_by_v=R @ over.mean.turn @ bRn,
         v_by_theta=R @ by_attitude,
         v_by_length=rotate(R, by_length),

@@ -16,6 +16,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.sensors.averaging import Stamp, after_stamp, averaging_spec, window_length
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
@@ -52,10 +53,7 @@ LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 # Plausible size, m/s. Chosen: ten times the bias of a DVL that is in order.
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
-# Plausible length, s. Chosen: what DVLs average over where nothing else is set.
-AVERAGING_SPEC = ParameterSpec(
-    "averaging", "s", labels=SCALAR, nuisance=True, plausible=0.3, usual=True
-)
+AVERAGING_SPEC = averaging_spec()
 CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
@@ -100,7 +98,7 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     time_offset_std_s: NonNegative = 0.5
     averaging_s: NonNegative = 0.0
     averaging_std_s: NonNegative | UnsetType = UNSET
-    stamp: Literal["start", "middle", "end"] = "middle"
+    stamp: Stamp = "middle"
     correlation_time_s: Positive | UnsetType = UNSET
     correlated_std_m_s: float | Sigma3 | UnsetType = UNSET
     scale_walk_std_sqrt_h: NonNegative = 0.0
@@ -113,12 +111,13 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     @property
     def middle(self) -> float:
         """How much later than its stamp the middle of the window is, s."""
-        return {"start": 0.5, "middle": 0.0, "end": -0.5}[self.stamp] * self.averaging_s
+        return after_stamp(self.stamp, self.averaging_s)
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The walk of the scale, where there is one."""
-        return ("scale_walk_std_sqrt_h",) if self.scale_walk_std_sqrt_h > 0.0 else ()
+        """The walk of the scale and the window, where there are any."""
+        keys = ("scale_walk_std_sqrt_h", "averaging_s")
+        return tuple(key for key in keys if getattr(self, key) > 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -270,7 +269,7 @@ class Dvl:
             Parameter(LEVER_ARM_SPEC, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
             Parameter(BIAS_SPEC, np.zeros(3), np.array(s.bias_std_m_s)),
             *CLOCK.parameters(s),
-            averaging(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
+            window_length(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
         )
 
@@ -406,13 +405,6 @@ class DvlVelocity(ObservationByRows):
             d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
             d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
         )
-
-
-def averaging(spec: ParameterSpec, length: float, std: float | UnsetType) -> Parameter:
-    """Return the length of a window; it is known for certain where its deviation is stated as 0."""
-    if isinstance(std, UnsetType):
-        return Parameter(spec, np.array([length]), np.zeros(1))
-    return Parameter(replace(spec, plausible=None), np.array([length]), np.array([std]))
 
 
 def _scale_spec(axes: int) -> ParameterSpec:

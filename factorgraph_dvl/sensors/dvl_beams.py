@@ -15,9 +15,17 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.sensors.averaging import Stamp, after_stamp, averaging_spec, window_length
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.dvl import CLOCK, LEVER_ARM_SPEC, MISALIGNMENT_SPEC, SCALE_SPEC
+from factorgraph_dvl.sensors.dvl import (
+    AVERAGING,
+    AVERAGING_SPEC,
+    CLOCK,
+    LEVER_ARM_SPEC,
+    MISALIGNMENT_SPEC,
+    SCALE_SPEC,
+)
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -64,6 +72,7 @@ SCALE_ERROR = scale_spec(1).name
 # Of the parameters that a DVL beside the beams has under the same names.
 BEAM_PREFIX = "beam_"
 _OWN_CLOCK = Clock.of("beam", prefix=BEAM_PREFIX)
+_OWN_AVERAGING = averaging_spec(BEAM_PREFIX)
 
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]
 Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
@@ -98,6 +107,9 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
     time_offset_std_s: NonNegative = 0.5
     velocity_std_m_s: NonNegative = 0.005
     velocity_std_fraction: NonNegative = 0.002
+    averaging_s: NonNegative = 0.0
+    averaging_std_s: NonNegative | UnsetType = UNSET
+    stamp: Stamp = "middle"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -274,6 +286,7 @@ class DvlBeams:
                 ),
                 lever_arm,
                 *self.clock.parameters(s),
+                self._window_length,
             )
         n = len(self.nominal_b)
         scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (n,))
@@ -287,12 +300,19 @@ class DvlBeams:
             Parameter(scale_spec(n), scale.copy(), np.full(n, s.scale_error_std)),
             lever_arm,
             *self.clock.parameters(s),
+            self._window_length,
         )
 
     @property
     def clock(self) -> Clock:
         """Clock of the instrument, that of the DVL unless a `dvl` stands beside it."""
         return _OWN_CLOCK if self.prefix else CLOCK
+
+    @property
+    def _window_length(self) -> Parameter:
+        s = self.settings
+        spec = _OWN_AVERAGING if self.prefix else AVERAGING_SPEC
+        return window_length(spec, s.averaging_s, s.averaging_std_s)
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the pings at which at least one beam was not lost."""
@@ -310,7 +330,16 @@ class DvlBeams:
         s = self.settings
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
         return (
-            BeamVelocity(self.time[m], measured, lost, noise, geometry, lever_arm, self.clock),
+            BeamVelocity(
+                self.time[m] + after_stamp(s.stamp, s.averaging_s),
+                measured,
+                lost,
+                noise,
+                geometry,
+                lever_arm,
+                self.clock,
+                self._window_length.name,
+            ),
         )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
@@ -361,6 +390,8 @@ class BeamVelocity:
         Name of the parameter.
     clock : Clock
         Clock of the instrument.
+    averaging : str, optional
+        Name of the length of the window over which it averages.
     """
 
     time: Array
@@ -370,6 +401,7 @@ class BeamVelocity:
     geometry: Geometry
     lever_arm: str
     clock: Clock = CLOCK
+    averaging: str | None = AVERAGING
     label: str = "Beam velocity"
     unit: str = "m/s"
     gate: float | None = None

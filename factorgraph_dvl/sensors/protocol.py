@@ -49,11 +49,13 @@ class Motion:
     turning_b, moving_n : ndarray, shape (M, 3), optional
         Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
         and m/s: where two motions that differ are blended.
+    turn_rate_b, move_rate_n : ndarray, shape (M, 3), optional
+        Rates at which attitude and position change, where v_n and omega_eb_b are means over
+        windows about the times.
     v_by_v, v_by_theta : ndarray, shape (M, 3, 3), optional
-        Of velocity and rate that are means over windows: derivatives of v_n by the velocity and by
-        the attitude in their middles.
+        Derivatives of such a v_n by the velocity and by the attitude in the middle.
     v_by_length, omega_by_length : ndarray, shape (M, 3), optional
-        Likewise derivatives of v_n and omega_eb_b by the length of the windows.
+        Derivatives of such v_n and omega_eb_b by the length of the windows.
     """
 
     nRb: Array
@@ -65,10 +67,21 @@ class Motion:
     omega_sigma: Array
     turning_b: Array | None = None
     moving_n: Array | None = None
+    turn_rate_b: Array | None = None
+    move_rate_n: Array | None = None
     v_by_v: Array | None = None
     v_by_theta: Array | None = None
     v_by_length: Array | None = None
     omega_by_length: Array | None = None
+
+    @property
+    def changes(self) -> tuple[Array, Array]:
+        """Rates at which attitude and position change, (M, 3) each, rad/s in b and m/s in n."""
+        if self.turn_rate_b is not None and self.move_rate_n is not None:
+            return self.turn_rate_b, self.move_rate_n
+        if self.turning_b is None or self.moving_n is None:
+            return self.omega_eb_b, self.v_n
+        return self.omega_eb_b + self.turning_b, self.v_n + self.moving_n
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import numpy as np
@@ -153,7 +153,12 @@ def simulate_dvl(
     half = 0.5 * truth.averaging_s
     time = time[(time >= half) & (time <= motion.duration - half)]
     water = _water(scenario, time, motion.at(time), water_rng)
-    velocity = _mean_dvl_velocity(scenario, motion, time, water)
+    velocity = _mean_over(
+        lambda when: _dvl_velocity(scenario, motion.at(when), water),
+        motion,
+        time,
+        truth.averaging_s,
+    )
     if scenario.noise:
         speed = np.linalg.norm(velocity, axis=1, keepdims=True)
         sigma = np.hypot(truth.velocity_std_m_s, truth.velocity_std_fraction * speed)
@@ -245,21 +250,19 @@ def moving_water(
     return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
 
 
-def _mean_dvl_velocity(
-    scenario: ScenarioView, motion: TrueMotion, time: Array, water: Array
+def _mean_over(
+    velocity: Callable[[Array], Array], motion: TrueMotion, time: Array, length: float
 ) -> Array:
-    """Return means of the DVL's velocity over windows about times (M,), by Gauss and Legendre."""
-    length = scenario.dvl.averaging_s
+    """Return means of a velocity over windows about times (M,), (M, 3), by Gauss and Legendre."""
     if length == 0.0:
-        return _dvl_velocity(scenario, motion.at(time), water)
-    points, weights = np.polynomial.legendre.leggauss(
-        _quadrature_order(motion.highest_rate() * length)
-    )
-    out = np.zeros((time.size, 3))
-    for point, weight in zip(points, weights, strict=True):
-        inside = np.clip(time + 0.5 * length * point, 0.0, motion.duration)
-        out += 0.5 * weight * _dvl_velocity(scenario, motion.at(inside), water)
-    return out
+        return velocity(time)
+    order = _quadrature_order(motion.highest_rate() * length)
+    points, weights = np.polynomial.legendre.leggauss(order)
+    means = [
+        0.5 * weight * velocity(np.clip(time + 0.5 * length * point, 0.0, motion.duration))
+        for point, weight in zip(points, weights, strict=True)
+    ]
+    return np.asarray(sum(means))
 
 
 def _dvl_velocity(scenario: ScenarioView, state: TrueState, current: Array) -> Array:

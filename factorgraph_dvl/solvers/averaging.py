@@ -29,11 +29,17 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.usual}
     out = []
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
-        p = known.get(bound.observation.averaging or "")
-        if p is not None and bound.weight.any():
-            if _chi_square(problem, bound, minimum, residual) > _SHOWN:
-                out.append(p)
+        p = known.get(_length(bound))
+        if p is None or not bound.weight.any():
+            continue
+        if _chi_square(problem, bound, minimum, residual) > _SHOWN:
+            out.append(p)
     return tuple(out)
+
+
+def _length(bound: BoundObservation) -> str:
+    """Return the name of the length of its window, empty if it has none."""
+    return bound.observation.averaging or ""
 
 
 def _chi_square(
@@ -45,7 +51,7 @@ def _chi_square(
     these, (jᵀr)² / (jᵀj - jᵀA P Aᵀj): the score test of `statistics.scores`, of one parameter.
     """
     evaluation = minimum.evaluation
-    values, name = evaluation.parameters, str(bound.observation.averaging)
+    values, name = evaluation.parameters, _length(bound)
     window = replace(bound, averages=True)
     motion = window.motion(window.attached(values), evaluation.states, values)
     lin = window.linearized(motion, values, [name], problem.processes_of(bound))

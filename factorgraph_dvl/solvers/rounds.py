@@ -106,8 +106,8 @@ def settle(
     known = KnownParameters()
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known, Noise(),
-        ImuNoise(), Uncorrelated(), walks,
+        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,
+        Noise(), ImuNoise(), Uncorrelated(), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:

@@ -1,0 +1,40 @@
+"""The window over which a sensor averages: its length as a parameter, and what its stamp means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from msgspec import UnsetType
+
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
+
+# What the stamp of a mean is the time of.
+Stamp = Literal["start", "middle", "end"]
+# Plausible length, s. Chosen: what instruments average over where nothing else is set.
+_USUAL_S = 0.3
+_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
+
+
+def averaging_spec(prefix: str = "") -> ParameterSpec:
+    """Return what the length of a window is; `prefix` is that of its name."""
+    return ParameterSpec(
+        f"{prefix}averaging", "s", labels=SCALAR, nuisance=True, plausible=_USUAL_S, usual=True
+    )
+
+
+def window_length(spec: ParameterSpec, length: float, std: float | UnsetType) -> Parameter:
+    """Return the length of a window.
+
+    Where its standard deviation is stated, tests leave it as it is.
+    """
+    if isinstance(std, UnsetType):
+        return Parameter(spec, np.array([length]), np.zeros(1))
+    final = replace(spec, usual=False, plausible=None)
+    return Parameter(final, np.array([length]), np.array([std]))
+
+
+def after_stamp(stamp: Stamp, length: float) -> float:
+    """Return how much later than its stamp the middle of a window is, s."""
+    return _MIDDLE[stamp] * length

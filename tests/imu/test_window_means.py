@@ -1,0 +1,107 @@
+"""Means over windows against quadrature of the motion itself, and by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from problems import SHORT, problem_of
+from truth import exact_states, scenario
+
+from factorgraph_dvl.geometry.vectors import rotate
+from factorgraph_dvl.imu.window_means import SHORTEST, windows
+
+SWAY = {
+    "roll": [{"amplitude_deg": 5, "frequency_hz": 0.4}],
+    "pitch": [{"amplitude_deg": 3, "frequency_hz": 0.7, "phase_deg": 60}],
+    "heave": [{"amplitude_m": 0.3, "frequency_hz": 0.5}],
+}
+TIME = np.array([2.03, 3.5, 5.21, 6.4])
+
+
+def exact(scene):
+    """Return the chain of a scenario, and its true states."""
+    problem, _ = problem_of(scene)
+    chain = problem.chain
+    states = exact_states(scene, chain.frame, chain.node_time)
+    return chain, states
+
+
+@pytest.fixture(scope="module")
+def moving():
+    return exact(scenario(manoeuvres=SHORT, sway=SWAY))
+
+
+def motion(moving, time, window=None):
+    chain, states = moving
+    return chain.motion(chain.attach(time, window=window), states)
+
+
+def body_velocity(at):
+    return rotate(at.nRb.transpose(0, 2, 1), at.v_n)
+
+
+def quadrature(moving, length, function):
+    """Return the mean over windows of a function of the motion, by 40 points of Gauss."""
+    points, weights = np.polynomial.legendre.leggauss(40)
+    parts = [
+        0.5 * w * function(motion(moving, TIME + 0.5 * length * x))
+        for x, w in zip(points, weights, strict=True)
+    ]
+    return np.sum(parts, axis=0)
+
+
+@pytest.mark.parametrize("length", [SHORTEST, 0.35, 1.0])
+def test_means_in_body_axes_are_those_of_the_motion(moving, length):
+    mean = motion(moving, TIME, length)
+    for found, of in (
+        (body_velocity(mean), body_velocity),
+        (mean.omega_eb_b, lambda at: at.omega_eb_b),
+    ):
+        # The rotation of the Earth within a window is left out.
+        np.testing.assert_allclose(found, quadrature(moving, length, of), atol=3e-5)
+
+
+def test_a_circle_by_hand():
+    """In body axes its velocity stays, and a rate that stays is its own mean."""
+    moving = exact(
+        scenario(
+            manoeuvres=[{"turn_deg_s": 30, "duration_s": 12}],
+            start={"lat_deg": 30, "lon_deg": 120, "height_m": 0, "heading_deg": 0, "speed_m_s": 2},
+            sway={},
+        )
+    )
+    mean = motion(moving, np.array([5.0, 6.3]), 2.0)
+    np.testing.assert_allclose(body_velocity(mean), np.tile([0.0, 2.0, 0.0], (2, 1)), atol=1e-4)
+    np.testing.assert_allclose(np.degrees(mean.omega_eb_b[:, 2]), [-30.0, -30.0], atol=0.01)
+
+
+@pytest.mark.parametrize("length", [-0.05, 0.07, 0.3, 1.0])
+def test_derivatives_by_length_and_time(moving, length):
+    h = 1e-4
+    middle = motion(moving, TIME, length)
+    longer, shorter = (motion(moving, TIME, length + sign * h) for sign in (1.0, -1.0))
+    later, earlier = (motion(moving, TIME + sign * h, length) for sign in (1.0, -1.0))
+    for found, change in (
+        (middle.v_by_length, longer.v_n - shorter.v_n),
+        (middle.omega_by_length, longer.omega_eb_b - shorter.omega_eb_b),
+        (middle.a_n, later.v_n - earlier.v_n),
+        (middle.alpha_b, later.omega_eb_b - earlier.omega_eb_b),
+        (middle.changes[1], later.p_n - earlier.p_n),
+    ):
+        change = change / (2.0 * h)
+        np.testing.assert_allclose(found, change, atol=1e-3 * np.abs(change).max())
+
+
+def test_short_windows_have_the_opposite_effect_of_negative_ones_and_none_has_none(moving):
+    chain, _ = moving
+    inc = chain.segments.increments
+    none, one, other = (windows(inc, TIME, length).mean.rate for length in (0.0, 0.08, -0.08))
+    np.testing.assert_allclose(one - none, none - other, atol=1e-12)
+    assert np.abs(none).max() < 0.02 * np.abs(one).max()
+
+
+def test_windows_end_where_the_samples_do(moving):
+    chain, _ = moving
+    inc = chain.segments.increments
+    edge = np.array([inc.start[0], inc.end[-1]])
+    assert np.isfinite(windows(inc, edge, 1.0).mean.added).all()

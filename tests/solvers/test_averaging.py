@@ -1,0 +1,82 @@
+"""A DVL that averages: stated, found, or not there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from monte_carlo import RUNS
+from scipy.stats import chi2
+from truth import CONFIGS
+
+from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.batch import solve
+
+MOUNT = (
+    *(f"misalignment_{axis}_deg" for axis in "xyz"),
+    "scale_error",
+    *(f"lever_arm_{axis}_m" for axis in "xyz"),
+)
+SWELL_HZ = 0.3
+
+
+def trial_of(length_s, seed, **claims):
+    """Return a navigation-grade trial in swell whose DVL averages."""
+    plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    for axis in ("roll", "pitch"):
+        plan["sway"][axis][0]["frequency_hz"] = SWELL_HZ
+    plan["dvl"]["averaging_s"] = length_s
+    plan["trial"]["dvl"] |= claims
+    return simulate(parse_scenario(plan), seed)
+
+
+def mount_nees(solution, trial):
+    errors = calibration_errors(solution, trial.calibration_truth)
+    rows = [errors.names.index(name) for name in MOUNT]
+    P = errors.covariance[np.ix_(rows, rows)]
+    return float(errors.error[rows] @ np.linalg.solve(P, errors.error[rows]))
+
+
+def sigma_of(solution, name):
+    return float(np.sqrt(solution.covariance[solution.order.index(name)][
+        solution.order.index(name)
+    ]))  # fmt: skip
+
+
+def test_a_stated_window_costs_no_precision_and_a_window_of_none_is_left_alone():
+    trial = trial_of(0.5, 1, averaging_s=0.5)
+    stated = solve(trial)
+    assert mount_nees(stated, trial) < chi2.ppf(0.999, 7)
+    none = trial_of(0.0, 1, averaging_s=0.0, averaging_std_s=0.0)
+    certain = solve(none)
+    for found in (stated, certain):
+        assert "averaging_s" not in found.order
+    for name in MOUNT:
+        assert sigma_of(stated, name) < 1.1 * sigma_of(certain, name)
+
+
+def test_a_window_that_is_not_stated_is_found():
+    trial = trial_of(0.5, 2)
+    found = solve(trial)
+    length = found.estimate("averaging_s")
+    assert abs(length.value[0] - 0.5) < 4.0 * length.std[0] < 0.1
+    assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length_s", [0.0, 0.1, 0.2, 0.5, 1.0, 2.0])
+def test_standard_deviations_hold_whatever_the_window(length_s):
+    nees, of_length = [], []
+    for seed in range(RUNS):
+        trial = trial_of(length_s, seed)
+        found = solve(trial)
+        nees.append(mount_nees(found, trial))
+        if "averaging_s" in found.order:
+            length = found.estimate("averaging_s")
+            of_length.append((length.value[0] - length_s) / length.std[0])
+    low, high = chi2.ppf([0.005, 0.995], 7 * RUNS)
+    assert low < sum(nees) < high, np.round(np.array(nees) / 7, 2)
+    if length_s > 0.1:
+        assert len(of_length) == RUNS
+        assert np.square(of_length).sum() < chi2.ppf(0.995, RUNS), np.round(of_length, 1)
