@@ -131,6 +131,7 @@ class Code(StrEnum):
     SMALL_RESIDUALS = "small_residuals"
     OUTLIERS = "outliers"
     ESTIMATED_INSTEAD = "estimated_instead"
+    AVERAGING = "averaging", "note"
     UNEXPLAINED_MISFIT = "unexplained_misfit", "error"
     MANY_REJECTED = "many_rejected"
     AMBIGUOUS = "ambiguous"

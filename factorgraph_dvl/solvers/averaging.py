@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,18 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.model import Estimated
 
 # χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
 # twenty is beyond, and loses some precision; one that does is left with less than two standard
 # deviations.
 _SHOWN = 2.7
+# Standard deviations from which on a length is one. Chosen: seldom by chance.
+_CERTAIN = 3.0
 
 
 def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
@@ -34,6 +40,24 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
             continue
         if _chi_square(problem, bound, minimum, residual) > _SHOWN:
             out.append(p)
+    return tuple(out)
+
+
+def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Finding, ...]:
+    """Return findings of the lengths that are estimated although they were stated as known."""
+    known = {p.name for p in stated if not p.estimated}
+    lengths = {p.name: p for p in at.problem.parameters if p.spec.usual and p.name in known}
+    out = []
+    for bound in at.problem.bound:
+        p = lengths.get(_length(bound))
+        if p is None:
+            continue
+        P = at.minimum.information.covariance_of([{at.problem.key(p.name): np.eye(1)}])
+        length, std = float(at.values[p.name][0]), float(np.sqrt(P[0, 0]))
+        if length > _CERTAIN * std:
+            label = bound.observation.label
+            text = message("averaging.found", sensor=label, length=length, std=std)
+            out.append(Finding(Code.AVERAGING, text, sensor=label, parameter=p.name))
     return tuple(out)
 
 

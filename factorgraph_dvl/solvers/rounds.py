@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
+from factorgraph_dvl.solvers.averaging import averaging_findings
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_others
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
@@ -128,6 +129,7 @@ def settle(
                 break
     findings = (
         *walks.findings,
+        *averaging_findings(prepared.parameters, at),
         *explanation_findings(known.freed, known.left, at.minimum.evaluation),
     )
     if going_on:

@@ -203,6 +203,7 @@ def _read_cerulean(path: Path, mapping: Mapping[str, Any] | None = None) -> Iter
             steps = np.diff(stamps)
             delay = np.where((steps > 0.0) & (steps < 10.0), -steps / 2.0, 0.0)
             batch.records["delay"] = delay
+            batch.records["window"] = np.where(delay < 0.0, -2.0 * delay, np.nan)
             yield Batch("dvl", batch.records, "own", "DVPDL", notes=(_MEAN_INCREMENT,))
         if len(extended):
             yield pings(extended, "own", "", "DVEXT")

@@ -81,6 +81,7 @@ _PING = np.dtype(
         ("sound_speed", "f8"),
         ("temperature", "f8"),
         ("delay", "f8"),
+        ("window", "f8"),
     ]
 )
 
@@ -92,7 +93,8 @@ _PING = np.dtype(
 #           `beams` m/s of the transducer along each outward beam; `range` m; roll, pitch, heading
 #           of the sensors that the instrument itself used; `alignment`: EA, beam 3 clockwise from
 #           the bow; `tilts_used`, `up`, `beam_angle`, `convex` as `janus` takes them; `delay`:
-#           from the stamp to the middle of the measurement, s.
+#           from the stamp to the middle of the measurement, s; `window` over which it is a mean,
+#           s.
 # water     the same through the water.
 # fix       `lat`, `lon`; `height` above the ellipsoid, `altitude` above the geoid, m; `quality`
 #           as in GGA; `std` of position and `velocity` m/s, `velocity_std`: east, north, up.

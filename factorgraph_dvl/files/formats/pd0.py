@@ -423,6 +423,9 @@ def _shift(common: Records, pings: Records) -> tuple[str, ...]:
     """Set the delays from stamps to the middle of averages; return what is said about them."""
     delay = 0.5 * (pings["pings"] - 1) * pings["ping_interval"]
     common["delay"] = np.where(delay > 0.0, delay, np.nan)
+    # Single pings at intervals i spread as much about their mean as a window of i √(n² - 1).
+    spread = np.sqrt(np.maximum(pings["pings"].astype(float) ** 2 - 1.0, 0.0))
+    common["window"] = np.where(delay > 0.0, spread * pings["ping_interval"], np.nan)
     stated, first = np.unique(delay, return_index=True)
     return tuple(
         _SHIFT.format(interval=pings["ping_interval"][place], delay=value)

@@ -276,6 +276,8 @@ def _add_log(
     out.decisions.add(
         log.pings.label, "no data sheet in the file → prior of a bias chosen", "dvl.bias_std_m_s"
     )
+    if log.window > 0.0:
+        keys["averaging_s"], keys["averaging_std_s"] = log.window, round(0.1 * log.window, 4)
     least = 0.5 if attitude is None else _LATENCY
     keys["time_offset_std_s"] = round(max(least, log.pings.offset_std), 3)
     if log.pings.rate_std:

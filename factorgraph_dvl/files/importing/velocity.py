@@ -42,6 +42,8 @@ class Velocities:
         Standard deviation of a velocity, or of one along a beam.
     own_std : bool
         Whether the instrument states that of each ping.
+    window : float, s
+        Length over which a ping is a mean; 0 where the instrument does not state it.
     locked, count : int
         Pings with lock, and all.
     """
@@ -51,6 +53,7 @@ class Velocities:
     directions: Array | None
     std: float
     own_std: bool
+    window: float
     locked: int
     count: int
 
@@ -159,9 +162,21 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
     directions = beam_geometry(pings) if locked and reference == "bottom" else None
     sample = pings.sample
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
-    return Velocities(
-        pings, reference, directions, _std(sample, label, decisions), own_std, locked, count
+    std, window = _std(sample, label, decisions), _window(sample, label, decisions)
+    return Velocities(pings, reference, directions, std, own_std, window, locked, count)
+
+
+def _window(sample: Records, label: str, decisions: Decisions) -> float:
+    stated = sample["window"][np.isfinite(sample["window"])]
+    if not len(stated):
+        return 0.0
+    window = round(float(np.median(stated)), 3)
+    decisions.add(
+        label,
+        f"each velocity is a mean → a window of {window:g} s",
+        "dvl.averaging_s",
     )
+    return window
 
 
 def _std(sample: Records, label: str, decisions: Decisions) -> float:

@@ -128,6 +128,7 @@ def movements(out: Records, delta: Array, interval: Array, stream: str) -> Batch
     interval = np.where(good, interval, np.nan)
     out["velocity"] = delta / interval[:, None]
     out["axes"], out["delay"] = INSTRUMENT, -0.5 * interval
+    out["window"] = interval
     return Batch("dvl", out, "own", stream, "FRD", notes=(_MOVEMENTS.format(stream),))
 
 
