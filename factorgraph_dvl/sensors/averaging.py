@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from msgspec import UnsetType
 
@@ -35,6 +36,12 @@ def window_length(spec: ParameterSpec, length: float, std: float | UnsetType) ->
     return Parameter(final, np.array([length]), np.array([std]))
 
 
-def after_stamp(stamp: Stamp, length: float) -> float:
-    """Return how much later than its stamp the middle of a window is, s."""
-    return _MIDDLE[stamp] * length
+def stamp_in_the_middle(record: Any) -> None:
+    """Move the stamps of a record, which is new, to the middles of its windows."""
+    settings = record.settings
+    shift = _MIDDLE[settings.stamp] * settings.averaging_s
+    if shift != 0.0:
+        # A new array: the one that was given is the caller's.
+        object.__setattr__(record, "time", record.time + shift)
+        settings = msgspec.structs.replace(settings, stamp="middle")
+        object.__setattr__(record, "settings", settings)

@@ -16,7 +16,12 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.sensors.averaging import Stamp, after_stamp, averaging_spec, window_length
+from factorgraph_dvl.sensors.averaging import (
+    Stamp,
+    averaging_spec,
+    stamp_in_the_middle,
+    window_length,
+)
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
@@ -109,11 +114,6 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     current_correlation_time_s: Positive | UnsetType = UNSET
 
     @property
-    def middle(self) -> float:
-        """How much later than its stamp the middle of the window is, s."""
-        return after_stamp(self.stamp, self.averaging_s)
-
-    @property
     def left_out(self) -> tuple[str, ...]:
         """The walk of the scale and the window, where there are any."""
         keys = ("scale_walk_std_sqrt_h", "averaging_s")
@@ -135,7 +135,8 @@ class Dvl:
     settings : DvlSettings
         Section `dvl` of trial.yaml.
     time : ndarray, shape (M,), s
-        Strictly increasing; true time plus the time offset.
+        Strictly increasing; true time plus the time offset. Stamps of means at the start or end of
+        their windows are moved to the middle.
     velocity : ndarray, shape (M, 3)
         Velocity of the DVL over the seabed (or through the water), in its own axes d, m/s; nan =
         no lock.
@@ -176,6 +177,7 @@ class Dvl:
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
+        stamp_in_the_middle(self)
         velocity = named_columns(VELOCITY_COLUMNS, self.velocity)
         check_all_or_none(velocity, self.source)
         check_range(velocity, -50.0, 50.0, "m/s", self.source)
@@ -282,7 +284,7 @@ class Dvl:
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
         s = self.settings
         correlated = expected_correlation(s.correlation_time_s, s.correlated_std_m_s, 3)
-        time, velocity = self.time[m] + s.middle, self.velocity[m]
+        time, velocity = self.time[m], self.velocity[m]
         rate = s.scale_walk_std_sqrt_h / np.sqrt(HOUR)
         walk = ScaleWalk(SCALE_ERROR, rate, time, velocity) if rate > 0.0 else None
         return (

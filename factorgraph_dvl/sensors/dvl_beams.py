@@ -15,7 +15,12 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, cross, rotate, skew
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.sensors.averaging import Stamp, after_stamp, averaging_spec, window_length
+from factorgraph_dvl.sensors.averaging import (
+    Stamp,
+    averaging_spec,
+    stamp_in_the_middle,
+    window_length,
+)
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.dvl import (
@@ -228,6 +233,7 @@ class DvlBeams:
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
+        stamp_in_the_middle(self)
         beams = named_columns(self.settings.more_columns, self.velocity)
         check_range(beams, -50.0, 50.0, "m/s", self.source)
 
@@ -331,7 +337,7 @@ class DvlBeams:
         noise = (s.velocity_std_m_s, s.velocity_std_fraction)
         return (
             BeamVelocity(
-                self.time[m] + after_stamp(s.stamp, s.averaging_s),
+                self.time[m],
                 measured,
                 lost,
                 noise,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import yaml
@@ -80,3 +82,12 @@ def test_standard_deviations_hold_whatever_the_window(length_s):
     if length_s > 0.1:
         assert len(of_length) == RUNS
         assert np.square(of_length).sum() < chi2.ppf(0.995, RUNS), np.round(of_length, 1)
+
+
+def test_a_stamp_at_the_end_is_half_a_window_late():
+    trial = trial_of(1.0, 1, averaging_s=1.0, stamp="end", time_offset_std_s=0.0)
+    late = replace(trial, dvl=replace(trial.dvl, time=trial.dvl.time + 0.5))
+    assert late.dvl.settings.stamp == "middle"
+    found = solve(late)
+    assert mount_nees(found, late) < chi2.ppf(0.999, 7)
+    assert found.verdict.grade == "good"
