@@ -376,7 +376,6 @@ class Walks:
             self._tried
             or not isinstance(prepared, Preparation)
             or self.known.left is not None
-            or self.known.freed
             or not _misfit(at.problem)
         ):
             return

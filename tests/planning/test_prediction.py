@@ -96,7 +96,13 @@ NO_SWAY = {"sway": {"roll": [], "pitch": [], "yaw": []}}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("with_an_ins", [False, True], ids=["attitude", "ins"])
+@pytest.mark.parametrize(
+    "with_an_ins",
+    [
+        pytest.param(False, id="attitude"),
+        pytest.param(True, marks=pytest.mark.study, id="ins"),
+    ],
+)
 def test_a_prediction_without_imu_is_what_the_solver_claims(with_an_ins):
     scene = config("ship", manoeuvres=LINES)
     if with_an_ins:

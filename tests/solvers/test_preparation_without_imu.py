@@ -204,6 +204,7 @@ def ins_scenario(repeat=1):
     return with_ins(shortened(repeat=repeat), SCHULER)
 
 
+@pytest.mark.slow
 def test_an_ins_alone_is_enough():
     trial = simulate(ins_scenario(), 3)
     solution = solve(trial, rate_hz=1.0)

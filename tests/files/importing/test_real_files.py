@@ -133,6 +133,7 @@ def solved(imported):
 
 
 @pytest.mark.slow
+@pytest.mark.study
 @pytest.mark.parametrize("path", [NENANA, WINRIVER], ids=lambda path: path.stem)
 def test_from_raw_file_to_a_scale(solved, path):
     # Fits of velocities alone give scales within 2 % of 1.
@@ -141,6 +142,7 @@ def test_from_raw_file_to_a_scale(solved, path):
 
 
 @pytest.mark.slow
+@pytest.mark.study
 @UNSETTLED
 @pytest.mark.parametrize("path", [NENANA, WINRIVER, VMDAS], ids=lambda path: path.stem)
 def test_from_raw_file_to_verdict(solved, path):
@@ -148,6 +150,7 @@ def test_from_raw_file_to_verdict(solved, path):
 
 
 @pytest.mark.slow
+@pytest.mark.study
 @UNSETTLED
 def test_a_current_in_a_tidal_race_leaves_a_scale_that_contains_none(solved):
     # At 0.01 to 1.2 m/s over ground, in a current that changes within half a minute.
