@@ -63,7 +63,8 @@ def check_jacobians(
     by_name = {p.name: p for p in parameters}
     # A clock is right unless the caller says otherwise.
     clock = () if observation.clock is None else observation.clock.names
-    values = {name: np.zeros(1) for name in clock} | values
+    window = () if observation.averaging is None else (observation.averaging,)
+    values = {name: np.zeros(1) for name in (*clock, *window)} | values
     lin = linearized(observation, motion, values, names, ZERO)
     m, d = lin.residual.shape
     np.testing.assert_allclose(lin.residual, observation.residual(motion, values), atol=1e-14)

@@ -13,6 +13,7 @@ TESTS = Path(__file__).parent
 # Modules without a test module that bears their name or imports them, and where what they do is
 # tested instead: they are parts of one thing, or stand behind a command or a catalogue.
 ELSEWHERE = {
+    "sensors/averaging": "solvers/test_averaging.py",
     "baselines/beam_calibration": "sensors/test_dvl_beams.py",
     "baselines/spurious_information": "baselines/test_calibration.py",
     "baselines/star_calibration": "sensors/test_star.py",

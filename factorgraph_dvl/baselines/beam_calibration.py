@@ -73,8 +73,8 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     used = received & attitude_is_known(everywhere)
     motion = motion_at(navigation, sensor.time[used])
     pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
-    clock = sensor.clock.names
-    parameters = tuple(p for p in sensor.parameters() if p.name not in clock)
+    apart = (*sensor.clock.names, sensor.window_length.name)
+    parameters = tuple(p for p in sensor.parameters() if p.name not in apart)
     outcome = beam_filter(pings, parameters)
     report("summary", 0, None)
     outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))

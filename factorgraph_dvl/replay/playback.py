@@ -271,8 +271,13 @@ def _solution(
                 "IMU",
             )
         )
-    if trial.imu is not None and trial.dvl is not None and trial.dvl.settings.left_out:
+    left_out = () if trial.imu is None or trial.dvl is None else trial.dvl.settings.left_out
+    if "scale_walk_std_sqrt_h" in left_out:
         findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
+    if "averaging_s" in left_out:
+        findings.append(
+            Finding(Code.ERROR_LEFT_OUT, message("error_left_out.window", section="dvl"), "DVL")
+        )
     if run.unused >= LEAST:
         findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:

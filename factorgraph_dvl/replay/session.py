@@ -104,6 +104,8 @@ class Replay:
                 expected="an imu section",
                 hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
             )
+        # A window would reach beyond the newest samples.
+        settings = settings.without_windows()
         self._findings: list[Finding] = []
         self._settings = settings
         self._sections = tuple(aid.section for aid in settings.aids)

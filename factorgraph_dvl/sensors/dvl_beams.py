@@ -292,7 +292,7 @@ class DvlBeams:
                 ),
                 lever_arm,
                 *self.clock.parameters(s),
-                self._window_length,
+                self.window_length,
             )
         n = len(self.nominal_b)
         scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (n,))
@@ -306,7 +306,7 @@ class DvlBeams:
             Parameter(scale_spec(n), scale.copy(), np.full(n, s.scale_error_std)),
             lever_arm,
             *self.clock.parameters(s),
-            self._window_length,
+            self.window_length,
         )
 
     @property
@@ -315,7 +315,8 @@ class DvlBeams:
         return _OWN_CLOCK if self.prefix else CLOCK
 
     @property
-    def _window_length(self) -> Parameter:
+    def window_length(self) -> Parameter:
+        """Length of the window over which the instrument averages."""
         s = self.settings
         spec = _OWN_AVERAGING if self.prefix else AVERAGING_SPEC
         return window_length(spec, s.averaging_s, s.averaging_std_s)
@@ -344,7 +345,7 @@ class DvlBeams:
                 geometry,
                 lever_arm,
                 self.clock,
-                self._window_length.name,
+                self.window_length.name,
             ),
         )
 

@@ -177,8 +177,9 @@ def simulate_dvl(
         "lever_arm_m": np.array(truth.lever_arm_m),
         "dvl_bias_m_s": np.zeros(3),
         "time_offset_s": np.zeros(1),
-        "averaging_s": np.array([truth.averaging_s]),
     }
+    if truth.averaging_s > 0.0:
+        calibration["averaging_s"] = np.array([truth.averaging_s])
     if truth.reference == "water":
         calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
         if truth.moving_water is not None:

@@ -567,7 +567,9 @@ def _left_out(trial: Trial) -> list[Finding]:
     return [
         Finding(
             Code.ERROR_LEFT_OUT,
-            message("error_left_out.change", section=aid.section, name=key),
+            message("error_left_out.window", section=aid.section)
+            if key == "averaging_s"
+            else message("error_left_out.change", section=aid.section, name=key),
             sensor=aid.label,
         )
         for aid in trial.aids

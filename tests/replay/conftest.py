@@ -58,7 +58,7 @@ def silent(stage, iteration, cost):
 
 @pytest.fixture(scope="session")
 def started() -> Started:
-    trial = simulate(scenario(noise=True), 2)
+    trial = simulate(scenario(noise=True), 2).without_windows()
     early = before(trial, STARTED)
     start = solve_start(early, None, 1.0, STARTED - 3.0, silent, 0.0)
     assert isinstance(start, ReplayStart), start

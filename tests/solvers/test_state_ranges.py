@@ -55,7 +55,7 @@ def solved(request):
     known = {
         p.name
         for p in found.problem.all_parameters
-        if not p.estimated and p.spec.plausible is not None
+        if not (p.estimated or p.spec.usual) and p.spec.plausible is not None
     }
     assert known > {*ERRORS}
     free = [wide(p, p.mean) if p.name in known else p for p in found.problem.all_parameters]
