@@ -26,6 +26,8 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 # Samples whose running integrals are in memory at once. Chosen: some ten megabytes.
 _CHUNK = 50_000
+# Samples between two windows from which on they are left out. Chosen: a second or more.
+_APART = 1000
 # Lengths, s, up to the longer of which the effect is a straight line in the square of the length
 # through these two: so it has a derivative at zero, and vibration between samples, which no sensor
 # follows, is averaged there too. In sway of 2 Hz it is off by 0.03 %.
@@ -159,9 +161,11 @@ def _inside(
 def _chunks(before: IntArray, after: IntArray, arc: IntArray) -> Iterator[slice]:
     """Yield windows in blocks of one arc and of not too many samples."""
     begin = 0
+    gaps = np.append(np.flatnonzero(before[1:] > after[:-1] + _APART) + 1, before.size)
     while begin < before.size:
         end = int(np.searchsorted(after, before[begin] + _CHUNK, side="right"))
         end = min(end, int(np.searchsorted(arc, arc[begin], side="right")))
+        end = min(end, int(gaps[np.searchsorted(gaps, begin, side="right")]))
         end = max(end, begin + 1)
         yield slice(begin, end)
         begin = end

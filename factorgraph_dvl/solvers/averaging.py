@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -20,6 +21,8 @@ from factorgraph_dvl.solvers.model import Estimated
 # twenty is beyond, and loses some precision; one that does is left with less than two standard
 # deviations.
 _SHOWN = 2.7
+# Measurements that are tested, and in how many stretches. Chosen: a third of a second of work.
+_ENOUGH, _STRETCHES = 5000, 20
 # Standard deviations from which on a length is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
 
@@ -41,6 +44,15 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         if _chi_square(problem, bound, minimum, residual) > _SHOWN:
             out.append(p)
     return tuple(out)
+
+
+def _some_of(count: int) -> IntArray:
+    """Return which of so many measurements are tested: of many, some stretches."""
+    if count <= _ENOUGH:
+        return np.arange(count)
+    length = _ENOUGH // _STRETCHES
+    first = np.linspace(0, count - length, _STRETCHES).astype(int)
+    return (first[:, None] + np.arange(length)).ravel()
 
 
 def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Finding, ...]:
@@ -76,27 +88,38 @@ def _chi_square(
     """
     evaluation = minimum.evaluation
     values, name = evaluation.parameters, _length(bound)
-    window = replace(bound, averages=True)
-    motion = window.motion(window.attached(values), evaluation.states, values)
-    lin = window.linearized(motion, values, [name], problem.processes_of(bound))
-    column = bound.weight * lin.d_parameters[name][:, :, 0]
-    score = -float(np.vdot(column, residual))
+    some = _some_of(len(residual))
+    window = replace(
+        bound,
+        observation=ObservationRows(bound.observation, some),
+        attachment=None,
+        usable=bound.usable[some],
+        weight=bound.weight[some],
+        averages=True,
+    )
+    window.attach(values)
+    motion = window.motion(window.attachment, evaluation.states, values)
+    own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
+    wanted = [p.name for p in own]
+    lin = window.linearized(motion, values, [*wanted, name], processes)
+    column = window.weight * lin.d_parameters[name][:, :, 0]
+    score = -float(np.vdot(column, residual[some]))
     if score <= 0.0:
         return 0.0
     information = minimum.square_root or factorized(problem, evaluation)[0]
+    rows, _ = window.jacobian(
+        lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
+    )
+    keys = window.keys_at(window.nodes(processes), processes, [problem.key(n) for n in wanted])
+    by_variables = np.einsum("md,mdn->mn", column, rows)
+    edges = np.cumsum([0, *window.sizes(processes, own)])
     taken_up: dict[int, Array] = {}
-    for rows in problem.observation_rows(evaluation):
-        if rows.source != bound.observation.label:
-            continue
-        some = column[rows.begin : rows.begin + len(rows.matrix)]
-        by_variables = np.einsum("md,mdn->mn", some, rows.matrix)
-        edges = np.cumsum([0, *rows.sizes])
-        for keys, a, b in zip(rows.keys.T, edges, edges[1:], strict=False):
-            different, place = np.unique(keys, return_inverse=True)
-            sums = np.zeros((different.size, b - a))
-            np.add.at(sums, place, by_variables[:, a:b])
-            for key, own in zip(different.tolist(), sums, strict=True):
-                taken_up[key] = taken_up.get(key, 0.0) + own[None]
+    for variable, first, last in zip(keys.T, edges, edges[1:], strict=False):
+        different, place = np.unique(variable, return_inverse=True)
+        sums = np.zeros((different.size, last - first))
+        np.add.at(sums, place, by_variables[:, first:last])
+        for key, each in zip(different.tolist(), sums, strict=True):
+            taken_up[key] = taken_up.get(key, 0.0) + each[None]
     left = float(np.vdot(column, column)) - float(information.covariance_of([taken_up])[0, 0])
     scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
     return score**2 / left / scatter if left > 0.0 else 0.0
