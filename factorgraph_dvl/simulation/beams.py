@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
 from factorgraph_dvl.simulation.instruments import DvlBeamsTruth, ScenarioView, TurntableTruth
-from factorgraph_dvl.simulation.measurements import apply, sample_times, within
+from factorgraph_dvl.simulation.measurements import apply, mean_over, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
 
 
@@ -28,9 +28,15 @@ def simulate_beams(
     jitter_rng, error_rng, noise_rng, lost_rng = rng.spawn(4)
     directions, scale = _drawn(truth, error_rng)
     time = sample_times(truth, motion.duration, jitter_rng)
-    state = motion.at(time)
-    bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
-    at_dvl = apply(bRn, state.v_n) + np.cross(state.omega_eb_b, truth.lever_arm_m)
+    half = 0.5 * truth.averaging_s
+    time = time[(time >= half) & (time <= motion.duration - half)]
+
+    def at_times(when: Array, window: IntArray) -> Array:
+        state = motion.at(when)
+        bRn = np.swapaxes(rotation_from_rph(state.rph, scenario.body_axes), 1, 2)
+        return apply(bRn, state.v_n) + np.cross(state.omega_eb_b, truth.lever_arm_m)
+
+    at_dvl = mean_over(at_times, motion, time, truth.averaging_s)
     velocity = np.stack(
         [(1.0 + k) * (at_dvl @ d) for k, d in zip(scale, directions, strict=True)], axis=1
     )
@@ -43,7 +49,10 @@ def simulate_beams(
         velocity[within(time, [(item.from_s, item.to_s)]), item.beam - 1] = np.nan
     settings = cast("DvlBeamsSettings", scenario.settings("dvl_beams"))
     prefix = "beam_" if scenario.dvl is not None else ""
-    calibration = {f"{prefix}lever_arm_m": np.array(truth.lever_arm_m)}
+    calibration = {
+        f"{prefix}lever_arm_m": np.array(truth.lever_arm_m),
+        f"{prefix}averaging_s": np.array([truth.averaging_s]),
+    }
     if settings.parametrisation == "beams":
         calibration |= {"beam_direction_b": directions, "beam_scale_error": scale}
     elif truth.direction_error_deg == () and np.ptp(scale) == 0.0:

@@ -336,6 +336,7 @@ class DvlBeamsTruth(ClockedInstrument, frozen=True, kw_only=True):
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     velocity_std_m_s: NonNegative = 0.0
     velocity_std_fraction: NonNegative = 0.0
+    averaging_s: NonNegative = 0.0
     no_lock_s: tuple[Interval, ...] = ()
     lost: tuple[LostBeam, ...] = ()
     lost_fraction: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0

@@ -14,7 +14,7 @@ from scipy.special import factorial
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, DEG_PER_SQRT_HOUR, HOUR, MICRO_G
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
@@ -153,8 +153,8 @@ def simulate_dvl(
     half = 0.5 * truth.averaging_s
     time = time[(time >= half) & (time <= motion.duration - half)]
     water = _water(scenario, time, motion.at(time), water_rng)
-    velocity = _mean_over(
-        lambda when: _dvl_velocity(scenario, motion.at(when), water),
+    velocity = mean_over(
+        lambda when, window: _dvl_velocity(scenario, motion.at(when), water[window]),
         motion,
         time,
         truth.averaging_s,
@@ -177,9 +177,8 @@ def simulate_dvl(
         "lever_arm_m": np.array(truth.lever_arm_m),
         "dvl_bias_m_s": np.zeros(3),
         "time_offset_s": np.zeros(1),
+        "averaging_s": np.array([truth.averaging_s]),
     }
-    if truth.averaging_s > 0.0:
-        calibration["averaging_s"] = np.array([truth.averaging_s])
     if truth.reference == "water":
         calibration["current_m_s"] = np.array(scenario.current_m_s[:2])
         if truth.moving_water is not None:
@@ -251,19 +250,46 @@ def moving_water(
     return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
 
 
-def _mean_over(
-    velocity: Callable[[Array], Array], motion: TrueMotion, time: Array, length: float
+def mean_over(
+    velocity: Callable[[Array, IntArray], Array], motion: TrueMotion, time: Array, length: float
 ) -> Array:
-    """Return means of a velocity over windows about times (M,), (M, 3), by Gauss and Legendre."""
+    """Return means of a velocity over windows about times (M,), (M, 3).
+
+    By Gauss and Legendre, on pieces between the kinks of the motion.
+
+    Parameters
+    ----------
+    velocity : callable
+        Velocity at times (K,) of windows (K,) by number, (K, 3), m/s.
+    motion : TrueMotion
+        The motion.
+    time : ndarray, shape (M,), s
+        Middles of the windows.
+    length : float, s
+        Length of the windows; 0 = the velocity at the times.
+    """
     if length == 0.0:
-        return velocity(time)
+        return velocity(time, np.arange(time.size))
     order = _quadrature_order(motion.highest_rate() * length)
     points, weights = np.polynomial.legendre.leggauss(order)
-    means = [
-        0.5 * weight * velocity(np.clip(time + 0.5 * length * point, 0.0, motion.duration))
-        for point, weight in zip(points, weights, strict=True)
+    edges = [
+        np.concatenate([[t - 0.5 * length], _between(motion.kinks, t, length), [t + 0.5 * length]])
+        for t in time
     ]
-    return np.asarray(sum(means))
+    window = np.repeat(np.arange(time.size), [each.size - 1 for each in edges])
+    first = np.concatenate([each[:-1] for each in edges])
+    width = np.concatenate([np.diff(each) for each in edges])
+    out = np.zeros((time.size, 3))
+    for point, weight in zip(points, weights, strict=True):
+        inside = np.clip(first + 0.5 * width * (point + 1.0), 0.0, motion.duration)
+        part = (0.5 * weight / length) * width[:, None] * velocity(inside, window)
+        np.add.at(out, window, part)
+    return out
+
+
+def _between(kinks: Array, time: float, length: float) -> Array:
+    """Return the kinks within a window."""
+    return kinks[np.abs(kinks - time) < 0.5 * length]
 
 
 def _dvl_velocity(scenario: ScenarioView, state: TrueState, current: Array) -> Array:

@@ -91,3 +91,24 @@ def test_a_stamp_at_the_end_is_half_a_window_late():
     found = solve(late)
     assert mount_nees(found, late) < chi2.ppf(0.999, 7)
     assert found.verdict.grade == "good"
+
+
+def test_single_beams_average_too():
+    plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    for axis in ("roll", "pitch"):
+        plan["sway"][axis][0]["frequency_hz"] = SWELL_HZ
+    del plan["dvl"], plan["trial"]["dvl"]
+    plan["dvl_beams"] = {
+        "rate_hz": 5,
+        "slant_azimuth_deg": [[30, bearing] for bearing in (45, 135, 225, 315)],
+        "lever_arm_m": [1.0, 1.2, 1.4],
+        "velocity_std_m_s": 0.003,
+        "averaging_s": 0.5,
+    }
+    plan["trial"]["dvl_beams"] = {"time_offset_std_s": 0}
+    trial = simulate(parse_scenario(plan), 1)
+    found = solve(trial)
+    length, arm = found.estimate("averaging_s"), found.estimate("lever_arm_m")
+    assert abs(length.value[0] - 0.5) < 4.0 * length.std[0] < 0.2
+    assert np.all(np.abs(arm.value - [1.0, 1.2, 1.4]) < 4.0 * arm.std)
+    assert np.all(arm.std < 0.02)
