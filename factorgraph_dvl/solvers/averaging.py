@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
@@ -23,27 +24,54 @@ from factorgraph_dvl.solvers.model import Estimated
 _SHOWN = 2.7
 # Measurements that are tested, and in how many stretches. Chosen: a third of a second of work.
 _ENOUGH, _STRETCHES = 5000, 20
-# Standard deviations from which on a length is one. Chosen: seldom by chance.
+# Relative size of an eigenvalue of information that is none.
+_ROUNDING = 1e-9
+# Share of a misfit that a window must explain. Chosen: more than any other cause can.
+_SHARE = 0.5
+# Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
 
 
 def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     """Return the lengths of windows that are taken as known and that the data contradict.
 
+    None where another parameter of the sensor that is taken as known, as its clock, explains more,
+    or where the window leaves most of a misfit: then the cause is another one.
+
     Parameters
     ----------
     problem, minimum : Problem or Minimum
         At its minimum.
     """
-    known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.usual}
+    known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.plausible}
     out = []
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         p = known.get(_length(bound))
-        if p is None or not bound.weight.any():
+        if p is None or not p.spec.usual or not bound.weight.any():
             continue
-        if _chi_square(problem, bound, minimum, residual) > _SHOWN:
+        own = [name for name in parameters_of(bound.observation) if name in known]
+        found = _chi_squares(problem, bound, minimum, residual, own)
+        fall = found[p.name]
+        scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
+        most = max(*found.values(), _SHARE * _misfit(bound, residual))
+        if fall > _SHOWN * scatter and fall >= most:
             out.append(p)
     return tuple(out)
+
+
+def _misfit(bound: BoundObservation, residual: Array) -> float:
+    """Return the squares of residuals beyond what they differ by from one to the next.
+
+    Zero where it may be chance.
+    """
+    used = bound.weight.all(axis=1)
+    own = residual[used]
+    if len(own) < 2:
+        return 0.0
+    noise = 0.5 * np.mean(np.diff(own, axis=0) ** 2, axis=0)
+    beyond = float(np.sum(own**2 - noise))
+    chance = float(np.sqrt(2.0 * np.sum(noise**2) * len(own)))
+    return beyond if beyond > _CERTAIN * chance else 0.0
 
 
 def _some_of(count: int) -> IntArray:
@@ -78,16 +106,21 @@ def _length(bound: BoundObservation) -> str:
     return bound.observation.averaging or ""
 
 
-def _chi_square(
-    problem: Problem, bound: BoundObservation, minimum: Minimum, residual: Array
-) -> float:
-    """Return twice the fall of the cost by a longer window, as residuals scatter.
+def _chi_squares(
+    problem: Problem,
+    bound: BoundObservation,
+    minimum: Minimum,
+    residual: Array,
+    known: Sequence[str],
+) -> dict[str, float]:
+    """Return twice the fall of the cost by each of some known parameters.
 
-    With j the whitened derivatives by the length, A those by all variables and P the covariance of
-    these, (jᵀr)² / (jᵀj - jᵀA P Aᵀj): the score test of `statistics.scores`, of one parameter.
+    With J the whitened derivatives by one of them, A those by all variables, P the covariance of
+    these and r the residuals, rᵀJ (JᵀJ - JᵀA P AᵀJ)⁻¹ Jᵀr: the score tests of `statistics.scores`,
+    at the price of no elimination. The length of a window counts only if it should be longer.
     """
     evaluation = minimum.evaluation
-    values, name = evaluation.parameters, _length(bound)
+    values, length = evaluation.parameters, _length(bound)
     some = _some_of(len(residual))
     window = replace(
         bound,
@@ -101,25 +134,32 @@ def _chi_square(
     motion = window.motion(window.attachment, evaluation.states, values)
     own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
     wanted = [p.name for p in own]
-    lin = window.linearized(motion, values, [*wanted, name], processes)
-    column = window.weight * lin.d_parameters[name][:, :, 0]
-    score = -float(np.vdot(column, residual[some]))
-    if score <= 0.0:
-        return 0.0
-    information = minimum.square_root or factorized(problem, evaluation)[0]
+    lin = window.linearized(motion, values, [*wanted, *known], processes)
+    columns = {name: window.weight[:, :, None] * lin.d_parameters[name] for name in known}
+    by_known = np.concatenate(list(columns.values()), axis=2)
+    score = -np.einsum("mdk,md->k", by_known, residual[some])
     rows, _ = window.jacobian(
         lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
     )
     keys = window.keys_at(window.nodes(processes), processes, [problem.key(n) for n in wanted])
-    by_variables = np.einsum("md,mdn->mn", column, rows)
+    by_variables = np.einsum("mdk,mdn->mkn", by_known, rows)
     edges = np.cumsum([0, *window.sizes(processes, own)])
     taken_up: dict[int, Array] = {}
     for variable, first, last in zip(keys.T, edges, edges[1:], strict=False):
         different, place = np.unique(variable, return_inverse=True)
-        sums = np.zeros((different.size, last - first))
-        np.add.at(sums, place, by_variables[:, first:last])
+        sums = np.zeros((different.size, by_known.shape[2], last - first))
+        np.add.at(sums, place, by_variables[:, :, first:last])
         for key, each in zip(different.tolist(), sums, strict=True):
-            taken_up[key] = taken_up.get(key, 0.0) + each[None]
-    left = float(np.vdot(column, column)) - float(information.covariance_of([taken_up])[0, 0])
-    scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-    return score**2 / left / scatter if left > 0.0 else 0.0
+            taken_up[key] = taken_up.get(key, 0.0) + each
+    information = minimum.square_root or factorized(problem, evaluation)[0]
+    left = np.einsum("mdk,mdl->kl", by_known, by_known) - information.covariance_of([taken_up])
+    out, begin = {}, 0
+    # Of all measurements, by those that are tested.
+    share = len(residual) / some.size
+    for name, column in columns.items():
+        part = slice(begin, begin + column.shape[2])
+        begin = part.stop
+        step = np.linalg.lstsq(left[part, part], score[part], rcond=_ROUNDING)[0]
+        fall = share * float(score[part] @ step)
+        out[name] = 0.0 if name == length and score[part][0] <= 0.0 else fall
+    return out

@@ -164,18 +164,19 @@ class Averaging:
     """Sensors that are stated to measure in no time: whether they average over a window."""
 
     name = "averaging"
-    _tested: bool = False
+    _tested: tuple[Any, ...] | None = None
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the length of a window, where the data show one."""
-        if self._tested or at.rough or at.problem.chain.interpolates:
+        model = at.model
+        if model.parameters is self._tested or at.rough or at.problem.chain.interpolates:
             return
-        self._tested = True
+        self._tested = model.parameters
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
         free = {p.name: wide(p, p.mean) for p in found}
-        parameters = tuple(free.get(p.name, p) for p in at.model.parameters)
+        parameters = tuple(free.get(p.name, p) for p in model.parameters)
         yield _from(at, parameters=parameters)
 
 
