@@ -171,7 +171,8 @@ def _printed(seed: int, velocity: str) -> _Printed:
         covariance[:, 3:6, 3:6] = smooth.covariance[:, 3:6, 3:6]
         motion = replace(motion, velocity=smooth.velocity, covariance=covariance)
     pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
-    parameters = tuple(p for p in sensor.parameters() if p.name not in sensor.clock.names)
+    apart = (*sensor.clock.names, sensor.window_length.name)
+    parameters = tuple(p for p in sensor.parameters() if p.name not in apart)
     estimated = beam_filter(pings, parameters, printed=True).estimated
     time, phi, _ = attitude_errors(pings, estimated, printed=True)
     true = rotation_from_rph(
