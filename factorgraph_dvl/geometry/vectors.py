@@ -57,6 +57,13 @@ def interpolate(time: Array, knots: Array, values: Array) -> Array:
     return at.reshape(time.size, *values.shape[1:])
 
 
+def sums_before(steps: Array) -> Array:
+    """Return the sums of all steps (N, ...) before each; before the first, zero."""
+    out = np.zeros_like(steps)
+    np.cumsum(steps[:-1], axis=0, out=out[1:])
+    return out
+
+
 def cross_variance(omega_sigma: Array, squares: Array) -> Array:
     """Return the variance, (M,), of omega x l across l, where it is largest.
 

@@ -22,12 +22,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.window_means import by_motion_in_the_middle
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import (
-    Linearization,
-    Motion,
-    Observation,
-    ObservationByRows,
-)
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
 
 # Unit of the residuals of attitudes.
 _ANGLE = "rad"
@@ -277,19 +272,20 @@ class BoundObservation:
         transitions : dict
             To times of a motion, by its identity and which they are: kept for other observations.
         """
-        here = rows_of(motion, some)
-        lin, when = by_motion_in_the_middle(lin.some(some), here), self.observation.time[some]
+        lin, when = lin.some(some), self.observation.time[some]
+        if motion.mean is not None:
+            lin = by_motion_in_the_middle(lin, rows_of(motion.mean, some))
         at, errors = rows_of(self.attachment, some), self.errors
         by = None if errors is None else rows_of(errors.sensitivity(self.attachment), some)
-        which = (
+        here = (
             id(motion),
             some.tobytes() if isinstance(some, np.ndarray) else (some.start, some.stop),
         )
-        if which not in transitions:
+        if here not in transitions:
             if errors is not None and by is not None:
                 at = errors.without(at, by, errors.vector(parameters))
-            transitions[which] = self.chain.transition(at, states, here)
-        transition = transitions[which]
+            transitions[here] = self.chain.transition(at, states, rows_of(motion, some))
+        transition = transitions[here]
         found = dict(lin.d_parameters)
         if errors is not None and by is not None:
             found |= errors.columns(lin, transition, by, errors.vector(parameters))

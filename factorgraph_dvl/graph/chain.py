@@ -218,8 +218,8 @@ class Chain(Protocol):
         before : object, optional
             Where they hung.
         window : float, optional, s
-            Length of windows about the times, of measurements that are means; a chain without
-            samples knows the motion at the times only.
+            Length of windows about the times, of measurements that are means. A chain without
+            samples, and one that carries the motion forward only, leave it out.
         """
 
     def missing(self, at: Any, lin: Linearization) -> Array | None:

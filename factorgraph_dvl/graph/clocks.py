@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation
 
 
 def parameters_of(observation: Observation) -> tuple[str, ...]:
-    """Return the names of all parameters of a measurement, those of its clock included."""
+    """Return the names of all parameters of a measurement, those of clock and window included."""
     clock, averaging = observation.clock, observation.averaging
     own = () if clock is None else clock.names
     return (*observation.parameters, *own, *(() if averaging is None else (averaging,)))
@@ -101,10 +101,10 @@ def linearized(
     if not {*own, averaging, clock, attitude_clock} & {*wanted}:
         return lin
 
-    def by_change(*of: tuple[Array | None, Array | None]) -> Array:
+    def by_change(*of: tuple[Array | None, Array]) -> Array:
         out = np.zeros((*lin.residual.shape, 1))
         for jacobian, change in of:
-            if jacobian is not None and change is not None:
+            if jacobian is not None:
                 out += jacobian @ change[:, :, None]
         return out
 
@@ -114,8 +114,11 @@ def linearized(
     by_time = turning + moving
     found = dict(lin.d_parameters)
     if averaging is not None and averaging in wanted:
-        found[averaging] = by_change(
-            (lin.d_v, motion.v_by_length), (lin.d_omega, motion.omega_by_length)
+        mean = motion.mean
+        found[averaging] = (
+            np.zeros_like(by_time)
+            if mean is None
+            else by_change((lin.d_v, mean.v_by_length), (lin.d_omega, mean.omega_by_length))
         )
     since = (observation.time - zero)[:, None, None]
     for name, by in zip(own, (-by_time, -by_time * since), strict=False):

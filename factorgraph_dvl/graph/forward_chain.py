@@ -19,10 +19,8 @@ from factorgraph_dvl.imu.propagation import (
     States,
     Transition,
     attach_smoothly,
-    averaged_motion,
     later,
     motion_at,
-    with_windows,
 )
 from factorgraph_dvl.imu.sensitivity import Sensitivity, at_errors, by_errors, corrected
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -56,8 +54,7 @@ class ForwardChain(InertialChain):
         """Return where times (M,) hang on the chain; beyond it, to first order from its edge."""
         rate = self.frame.earth_rate
         at, beyond = attach_smoothly(self.segments, time, rate)
-        at = later(at, beyond, rate) if beyond.any() else at
-        return with_windows(self.segments, at, time, window)
+        return later(at, beyond, rate) if beyond.any() else at
 
     def missing(self, at: Any, lin: Linearization) -> None:
         """Return None: the noise since the node is left out."""
@@ -65,8 +62,7 @@ class ForwardChain(InertialChain):
 
     def motion(self, at: Any, states: States) -> Motion:
         """Return the motion at M attached times, carried from the nodes before."""
-        motion = motion_at(at, states, self.gravity_n, self.frame.earth_rate)
-        return averaged_motion(motion, at, self.gravity_n)
+        return motion_at(at, states, self.gravity_n, self.frame.earth_rate)
 
     def transition(self, at: Any, states: States, motion: Motion) -> Any:
         """Return the derivatives of the motion at attached times by the nodes before."""

@@ -15,7 +15,15 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import cumulative_products, exp_so3, log_so3
-from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.geometry.vectors import (
+    IDENTITY,
+    Array,
+    IntArray,
+    cross,
+    rotate,
+    skew,
+    sums_before,
+)
 from factorgraph_dvl.imu.increments import Increments, increments
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
@@ -477,11 +485,8 @@ def one_segment(inc: Increments, first: int, last: int) -> Segments:
     dR = cumulative_products(np.concatenate([IDENTITY[None], turn[:-1]]))
     dt = inc.dt[inside, None]
     turned = rotate(dR, dv)
-    dV, dP = np.zeros((2, inside.size, 3))
-    dA = np.zeros((inside.size, 3, 3))
-    turned[:-1].cumsum(axis=0, out=dV[1:])
-    (dR @ left * dt[:, :, None])[:-1].cumsum(axis=0, out=dA[1:])
-    (dV * dt + 0.5 * turned * dt)[:-1].cumsum(axis=0, out=dP[1:])
+    dV, dA = sums_before(turned), sums_before(dR @ left * dt[:, :, None])
+    dP = sums_before(dV * dt + 0.5 * turned * dt)
     knots, whole = Integrals(dR, dV, dP, dA), slice(-1, None)
     return Segments(
         increments=inc,

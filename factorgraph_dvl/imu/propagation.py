@@ -14,7 +14,6 @@ from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, r
 from factorgraph_dvl.imu.between_samples import between_samples
 from factorgraph_dvl.imu.increments import Partial
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.window_means import Windows, averaged, windows
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 # Times that are attached at once. Chosen: some ten megabytes.
@@ -66,8 +65,6 @@ class Attachment:
         Standard deviation of alpha and force from noise.
     turn : ndarray, shape (M, 3, 3)
         Exp(-earth_rate tau).
-    windows : Windows, optional
-        Windows about the times, of measurements that are means.
     """
 
     segment: IntArray
@@ -84,7 +81,6 @@ class Attachment:
     alpha_sigma: Array
     force_sigma: Array
     turn: Array
-    windows: Windows | None = None
 
 
 def attach(seg: Segments, time: Array, earth_rate_n: Array, *, rates: bool = True) -> Attachment:
@@ -135,14 +131,6 @@ def attach_inside(
     index, since, covered = inc.locate(time)
     nearest = inc.start[index] + np.clip(since, 0.0, inc.dt[index])
     return attach(seg, np.where(covered, time, nearest), earth_rate_n), covered
-
-
-def with_windows(seg: Segments, at: Attachment, time: Array, window: float | None) -> Attachment:
-    """Return an attachment with windows of a length about its times (M,); None = without."""
-    if window is None:
-        return at
-    found = windows(seg.increments, time, window)
-    return replace(at, windows=found, alpha_sigma=found.slope_sigma, force_sigma=found.force_sigma)
 
 
 def segment_ends(seg: Segments, earth_rate_n: Array, *, rates: bool = True) -> Attachment:
@@ -330,11 +318,6 @@ def motion_at(
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,
     )
-
-
-def averaged_motion(motion: Motion, at: Attachment, gravity_n: Array) -> Motion:
-    """Return a motion as its windows average it; gravity as of `motion_at`."""
-    return motion if at.windows is None else averaged(motion, at.windows, gravity_n[at.segment])
 
 
 def extrapolated(motion: Motion, late: Array) -> Motion:

@@ -25,11 +25,10 @@ from factorgraph_dvl.imu.propagation import (
     States,
     Transition,
     attach_smoothly,
-    averaged_motion,
     extrapolated,
     motion_at,
-    with_windows,
 )
+from factorgraph_dvl.imu.window_means import Windows, averaged, windows
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
 
@@ -48,6 +47,8 @@ class TwoWay:
         Ratio of s (1 - s) / 2 and the derivative of s, which both vanish at nodes.
     beyond : ndarray, shape (M,), s
         How much later than there each time is, where the chain does not cover it.
+    windows : Windows, optional
+        Windows about the times, of measurements that are means.
     """
 
     forward: Attachment
@@ -56,6 +57,7 @@ class TwoWay:
     share_rate: Array
     bend: Array
     beyond: Array
+    windows: Windows | None = None
 
     @property
     def node(self) -> IntArray:
@@ -116,7 +118,10 @@ def attach_two_way(
 
 def _attached(seg: Segments, time: Array, earth_rate_n: Array, window: float | None) -> TwoWay:
     forward, beyond = attach_smoothly(seg, time, earth_rate_n)
-    forward = with_windows(seg, forward, time, window)
+    found = None
+    if window is not None:
+        found = windows(seg.increments, time, window)
+        forward = replace(forward, alpha_sigma=found.slope_sigma, force_sigma=found.force_sigma)
     span = seg.duration[forward.segment]
     u = np.clip(forward.tau / span, 0.0, 1.0)
     tau = forward.tau - span
@@ -130,6 +135,7 @@ def _attached(seg: Segments, time: Array, earth_rate_n: Array, window: float | N
         share_rate=6.0 * u * (1.0 - u) / span,
         bend=span * u * (1.0 - u) * (3.0 - 2.0 * u) * (1.0 + 2.0 * u) / 12.0,
         beyond=beyond,
+        windows=found,
     )
 
 
@@ -178,7 +184,8 @@ def motion_two_way(at: TwoWay, states: States, gravity_n: Array, earth_rate_n: A
         turning_b=rate * turn,
         moving_n=rate * shift,
     )
-    return averaged_motion(extrapolated(blended, at.beyond), at.forward, gravity_n)
+    motion = extrapolated(blended, at.beyond)
+    return motion if at.windows is None else averaged(motion, at.windows, gravity_n[at.segment])
 
 
 def transition_two_way(

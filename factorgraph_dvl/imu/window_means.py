@@ -19,10 +19,18 @@ import numpy as np
 
 from factorgraph_dvl.geometry.records import concatenated, rows_of
 from factorgraph_dvl.geometry.rotations import cumulative_products, exp_so3
-from factorgraph_dvl.geometry.vectors import IDENTITY, Array, IntArray, cross, rotate, skew
+from factorgraph_dvl.geometry.vectors import (
+    IDENTITY,
+    Array,
+    IntArray,
+    cross,
+    rotate,
+    skew,
+    sums_before,
+)
 from factorgraph_dvl.imu.between_samples import between_samples
 from factorgraph_dvl.imu.increments import Increments, Partial
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, MeanMotion, Motion
 
 # Samples whose running integrals are in memory at once. Chosen: some ten megabytes.
 _CHUNK = 50_000
@@ -214,9 +222,9 @@ class _Run:
         phi, dv = inc.over(inside)
         time = inc.start[inside] - inc.start[begin]
         dR = cumulative_products(np.concatenate([IDENTITY[None], exp_so3(phi[:-1])]))
-        dV = _before(rotate(dR, dv))
+        dV = sums_before(rotate(dR, dv))
         steps = _steps(dR, dV, phi, dv, time, inc.dt[inside])
-        return cls(inc, begin, time, dR, dV, tuple(_before(each) for each in steps))
+        return cls(inc, begin, time, dR, dV, tuple(sums_before(each) for each in steps))
 
     def at(self, index: IntArray, since: Array) -> _Point:
         """Return the motion `since` seconds after the start of intervals `index`."""
@@ -249,18 +257,6 @@ def _steps(
     crossed = cross(phi, dv)
     added = (dv / 2.0 - crossed / 3.0 + cross(phi, crossed) / 8.0) * h[:, :, 0]
     return back, moment, rotate(back, dV) + added, phi
-
-
-def _before(steps: Array) -> Array:
-    """Return the sums of all steps before each."""
-    out = np.zeros_like(steps)
-    np.cumsum(steps[:-1], axis=0, out=out[1:])
-    return out
-
-
-def _per_second(values: Array, half: Array) -> Array:
-    """Return values (M, ...) by the lengths of windows of some halves."""
-    return values / (2.0 * half).reshape(-1, *[1] * (values.ndim - 1))
 
 
 def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Windows:
@@ -350,22 +346,24 @@ def averaged(motion: Motion, over: Windows, gravity_n: Array) -> Motion:
         a_n=rotate(R, cross(rate, mean_b) + by_time),
         alpha_b=over.by_time.rate,
         omega_sigma=np.repeat(over.rate_sigma[:, None], 3, axis=1),
-        turn_rate_b=rate,
-        move_rate_n=move,
-        v_by_v=R @ over.mean.turn @ bRn,
-        v_by_theta=R @ by_attitude,
-        v_by_length=rotate(R, by_length),
-        omega_by_length=over.by_length.rate,
+        mean=MeanMotion(
+            turn_rate_b=rate,
+            move_rate_n=move,
+            v_by_v=R @ over.mean.turn @ bRn,
+            v_by_theta=R @ by_attitude,
+            v_by_length=rotate(R, by_length),
+            omega_by_length=over.by_length.rate,
+        ),
     )
 
 
-def by_motion_in_the_middle(lin: Linearization, motion: Motion) -> Linearization:
+def by_motion_in_the_middle(lin: Linearization, mean: MeanMotion) -> Linearization:
     """Return derivatives by a mean motion as those by the motion in the middle of the windows."""
-    if lin.d_v is None or motion.v_by_v is None or motion.v_by_theta is None:
+    if lin.d_v is None:
         return lin
-    turned = lin.d_v @ motion.v_by_theta
+    turned = lin.d_v @ mean.v_by_theta
     return replace(
         lin,
-        d_v=lin.d_v @ motion.v_by_v,
+        d_v=lin.d_v @ mean.v_by_v,
         d_theta=turned if lin.d_theta is None else lin.d_theta + turned,
     )

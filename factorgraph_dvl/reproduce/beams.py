@@ -171,9 +171,7 @@ def _printed(seed: int, velocity: str) -> _Printed:
         covariance[:, 3:6, 3:6] = smooth.covariance[:, 3:6, 3:6]
         motion = replace(motion, velocity=smooth.velocity, covariance=covariance)
     pings = BeamPings(motion, sensor.nominal_b, sensor.velocity[used], sensor.sigma()[used])
-    apart = (*sensor.clock.names, sensor.window_length.name)
-    parameters = tuple(p for p in sensor.parameters() if p.name not in apart)
-    estimated = beam_filter(pings, parameters, printed=True).estimated
+    estimated = beam_filter(pings, sensor.mounting_parameters(), printed=True).estimated
     time, phi, _ = attitude_errors(pings, estimated, printed=True)
     true = rotation_from_rph(
         reference.rph[np.searchsorted(reference.time, time - 1e-6)], trial.body_axes

@@ -269,7 +269,12 @@ class DvlBeams:
         return np.maximum(model, _LEAST_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return directions or misalignment, scale errors, lever arm and clock."""
+        """Return directions or misalignment, scale errors, lever arm, clock and window."""
+        clock = self.clock.parameters(self.settings)
+        return (*self.mounting_parameters(), *clock, self.window_length)
+
+    def mounting_parameters(self) -> tuple[Parameter, Parameter, Parameter]:
+        """Return directions or misalignment, scale errors and lever arm."""
         s = self.settings
         lever_arm = Parameter(
             of_beams(LEVER_ARM_SPEC, self.prefix),
@@ -291,8 +296,6 @@ class DvlBeams:
                     np.array([s.scale_error_std]),
                 ),
                 lever_arm,
-                *self.clock.parameters(s),
-                self.window_length,
             )
         n = len(self.nominal_b)
         scale = np.broadcast_to(np.array(s.scale_error, dtype=float), (n,))
@@ -305,8 +308,6 @@ class DvlBeams:
             ),
             Parameter(scale_spec(n), scale.copy(), np.full(n, s.scale_error_std)),
             lever_arm,
-            *self.clock.parameters(s),
-            self.window_length,
         )
 
     @property
@@ -326,7 +327,7 @@ class DvlBeams:
         m = np.logical_not(self.missing)
         if not m.any():
             return ()
-        misalignment, scale, lever_arm, *_ = (p.name for p in self.parameters())
+        misalignment, scale, lever_arm = (p.name for p in self.mounting_parameters())
         geometry: Geometry = (
             CommonGeometry(self.settings.nominal_d, misalignment, scale)
             if self.settings.parametrisation == "common"

@@ -28,6 +28,28 @@ USUAL_CORRELATION_TIME = 100.0
 
 
 @dataclass(frozen=True)
+class MeanMotion:
+    """How velocity and rate that are means over windows depend on the motion in their middles.
+
+    Parameters
+    ----------
+    turn_rate_b, move_rate_n : ndarray, shape (M, 3), rad/s, m/s
+        Rates at which attitude and position change.
+    v_by_v, v_by_theta : ndarray, shape (M, 3, 3)
+        Derivatives of the mean v_n by the velocity and by the attitude.
+    v_by_length, omega_by_length : ndarray, shape (M, 3)
+        Derivatives of the mean v_n and omega_eb_b by the length of the windows.
+    """
+
+    turn_rate_b: Array
+    move_rate_n: Array
+    v_by_v: Array
+    v_by_theta: Array
+    v_by_length: Array
+    omega_by_length: Array
+
+
+@dataclass(frozen=True)
 class Motion:
     """Motion of the body at the times of M measurements.
 
@@ -49,13 +71,8 @@ class Motion:
     turning_b, moving_n : ndarray, shape (M, 3), optional
         Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
         and m/s: where two motions that differ are blended.
-    turn_rate_b, move_rate_n : ndarray, shape (M, 3), optional
-        Rates at which attitude and position change, where v_n and omega_eb_b are means over
-        windows about the times.
-    v_by_v, v_by_theta : ndarray, shape (M, 3, 3), optional
-        Derivatives of such a v_n by the velocity and by the attitude in the middle.
-    v_by_length, omega_by_length : ndarray, shape (M, 3), optional
-        Derivatives of such v_n and omega_eb_b by the length of the windows.
+    mean : MeanMotion, optional
+        How v_n and omega_eb_b depend on the motion, where they are means over windows.
     """
 
     nRb: Array
@@ -67,18 +84,13 @@ class Motion:
     omega_sigma: Array
     turning_b: Array | None = None
     moving_n: Array | None = None
-    turn_rate_b: Array | None = None
-    move_rate_n: Array | None = None
-    v_by_v: Array | None = None
-    v_by_theta: Array | None = None
-    v_by_length: Array | None = None
-    omega_by_length: Array | None = None
+    mean: MeanMotion | None = None
 
     @property
     def changes(self) -> tuple[Array, Array]:
         """Rates at which attitude and position change, (M, 3) each, rad/s in b and m/s in n."""
-        if self.turn_rate_b is not None and self.move_rate_n is not None:
-            return self.turn_rate_b, self.move_rate_n
+        if self.mean is not None:
+            return self.mean.turn_rate_b, self.mean.move_rate_n
         if self.turning_b is None or self.moving_n is None:
             return self.omega_eb_b, self.v_n
         return self.omega_eb_b + self.turning_b, self.v_n + self.moving_n

@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 from factorgraph_dvl.sensors.turntable import Turntable, TurntableSettings
 from factorgraph_dvl.simulation.instruments import DvlBeamsTruth, ScenarioView, TurntableTruth
-from factorgraph_dvl.simulation.measurements import apply, mean_over, sample_times, within
+from factorgraph_dvl.simulation.measurements import apply, mean_over, middles, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
 
 
@@ -28,8 +28,7 @@ def simulate_beams(
     jitter_rng, error_rng, noise_rng, lost_rng = rng.spawn(4)
     directions, scale = _drawn(truth, error_rng)
     time = sample_times(truth, motion.duration, jitter_rng)
-    half = 0.5 * truth.averaging_s
-    time = time[(time >= half) & (time <= motion.duration - half)]
+    time = middles(time, motion, truth.averaging_s)
 
     def at_times(when: Array, window: IntArray) -> Array:
         state = motion.at(when)

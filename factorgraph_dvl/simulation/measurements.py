@@ -150,8 +150,7 @@ def simulate_dvl(
     truth: DvlTruth = scenario.dvl
     jitter_rng, noise_rng, water_rng = rng.spawn(3)
     time = sample_times(truth, motion.duration, jitter_rng)
-    half = 0.5 * truth.averaging_s
-    time = time[(time >= half) & (time <= motion.duration - half)]
+    time = middles(time, motion, truth.averaging_s)
     water = _water(scenario, time, motion.at(time), water_rng)
     velocity = mean_over(
         lambda when, window: _dvl_velocity(scenario, motion.at(when), water[window]),
@@ -250,6 +249,12 @@ def moving_water(
     return walk + np.stack([np.interp(passed, passed[knots], x) for x in beyond.T], axis=1)
 
 
+def middles(time: Array, motion: TrueMotion, length: float) -> Array:
+    """Return the times (M,) about which a window of a length lies within the motion."""
+    half = 0.5 * length
+    return time[(time >= half) & (time <= motion.duration - half)]
+
+
 def mean_over(
     velocity: Callable[[Array, IntArray], Array], motion: TrueMotion, time: Array, length: float
 ) -> Array:
@@ -272,8 +277,9 @@ def mean_over(
         return velocity(time, np.arange(time.size))
     order = _quadrature_order(motion.highest_rate() * length)
     points, weights = np.polynomial.legendre.leggauss(order)
+    half = 0.5 * length
     edges = [
-        np.concatenate([[t - 0.5 * length], _between(motion.kinks, t, length), [t + 0.5 * length]])
+        np.concatenate([[t - half], motion.kinks[np.abs(motion.kinks - t) < half], [t + half]])
         for t in time
     ]
     window = np.repeat(np.arange(time.size), [each.size - 1 for each in edges])
@@ -285,11 +291,6 @@ def mean_over(
         part = (0.5 * weight / length) * width[:, None] * velocity(inside, window)
         np.add.at(out, window, part)
     return out
-
-
-def _between(kinks: Array, time: float, length: float) -> Array:
-    """Return the kinks within a window."""
-    return kinks[np.abs(kinks - time) < 0.5 * length]
 
 
 def _dvl_velocity(scenario: ScenarioView, state: TrueState, current: Array) -> Array:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,9 +52,11 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
             continue
         own = [name for name in parameters_of(bound.observation) if name in known]
         found = _chi_squares(problem, bound, minimum, residual, own)
+        if not found:
+            continue
         fall = found[p.name]
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        most = max(*found.values(), _SHARE * _misfit(bound, residual))
+        most = max(_SHARE * _misfit(bound, residual), *found.values())
         if fall > _SHOWN * scatter and fall >= most:
             out.append(p)
     return tuple(out)
@@ -117,7 +120,7 @@ def _chi_squares(
 
     With J the whitened derivatives by one of them, A those by all variables, P the covariance of
     these and r the residuals, rᵀJ (JᵀJ - JᵀA P AᵀJ)⁻¹ Jᵀr: the score tests of `statistics.scores`,
-    at the price of no elimination. The length of a window counts only if it should be longer.
+    at the price of no elimination. Nothing where the window should not be longer.
     """
     evaluation = minimum.evaluation
     values, length = evaluation.parameters, _length(bound)
@@ -138,6 +141,9 @@ def _chi_squares(
     columns = {name: window.weight[:, :, None] * lin.d_parameters[name] for name in known}
     by_known = np.concatenate(list(columns.values()), axis=2)
     score = -np.einsum("mdk,md->k", by_known, residual[some])
+    parts = dict(zip(columns, _parts(columns.values()), strict=True))
+    if score[parts[length]][0] <= 0.0:
+        return {}
     rows, _ = window.jacobian(
         lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
     )
@@ -153,13 +159,16 @@ def _chi_squares(
             taken_up[key] = taken_up.get(key, 0.0) + each
     information = minimum.square_root or factorized(problem, evaluation)[0]
     left = np.einsum("mdk,mdl->kl", by_known, by_known) - information.covariance_of([taken_up])
-    out, begin = {}, 0
     # Of all measurements, by those that are tested.
     share = len(residual) / some.size
-    for name, column in columns.items():
-        part = slice(begin, begin + column.shape[2])
-        begin = part.stop
+    out = {}
+    for name, part in parts.items():
         step = np.linalg.lstsq(left[part, part], score[part], rcond=_ROUNDING)[0]
-        fall = share * float(score[part] @ step)
-        out[name] = 0.0 if name == length and score[part][0] <= 0.0 else fall
+        out[name] = share * float(score[part] @ step)
     return out
+
+
+def _parts(columns: Iterable[Array]) -> list[slice]:
+    """Return the places of columns (M, d, n) side by side."""
+    edges = np.cumsum([0, *(column.shape[2] for column in columns)]).tolist()
+    return [slice(a, b) for a, b in pairwise(edges)]

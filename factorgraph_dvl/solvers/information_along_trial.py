@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array, IntArray, sums_before
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
@@ -106,9 +106,7 @@ def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[
     by_node, given = found.spurious, found.covariances.given
     if by_node is None:
         by_node = spurious_information(problem, found.minimum.evaluation, given)
-    spurious = np.zeros_like(by_node)
-    np.cumsum(by_node[:-1], axis=0, out=spurious[1:])
-    spurious = spurious[shown]
+    spurious = sums_before(by_node)[shown]
     # The last columns are those of the parameters: their triangle has all else eliminated.
     root = triangles[:, -size:, -size:] @ problem.prior_root
     data = np.swapaxes(root, 1, 2) @ root - np.eye(size)

@@ -82,8 +82,8 @@ def test_derivatives_by_length_and_time(moving, length):
     longer, shorter = (motion(moving, TIME, length + sign * h) for sign in (1.0, -1.0))
     later, earlier = (motion(moving, TIME + sign * h, length) for sign in (1.0, -1.0))
     for found, change in (
-        (middle.v_by_length, longer.v_n - shorter.v_n),
-        (middle.omega_by_length, longer.omega_eb_b - shorter.omega_eb_b),
+        (middle.mean.v_by_length, longer.v_n - shorter.v_n),
+        (middle.mean.omega_by_length, longer.omega_eb_b - shorter.omega_eb_b),
         (middle.a_n, later.v_n - earlier.v_n),
         (middle.alpha_b, later.omega_eb_b - earlier.omega_eb_b),
         (middle.changes[1], later.p_n - earlier.p_n),

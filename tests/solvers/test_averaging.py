@@ -23,11 +23,17 @@ MOUNT = (
 SWELL_HZ = 0.3
 
 
-def trial_of(length_s, seed, **claims):
-    """Return a navigation-grade trial in swell whose DVL averages."""
+def plan_in_swell():
+    """Return the scenario of a navigation-grade trial in swell."""
     plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
     for axis in ("roll", "pitch"):
         plan["sway"][axis][0]["frequency_hz"] = SWELL_HZ
+    return plan
+
+
+def trial_of(length_s, seed, **claims):
+    """Return a trial in swell whose DVL averages."""
+    plan = plan_in_swell()
     plan["dvl"]["averaging_s"] = length_s
     plan["trial"]["dvl"] |= claims
     return simulate(parse_scenario(plan), seed)
@@ -41,9 +47,8 @@ def mount_nees(solution, trial):
 
 
 def sigma_of(solution, name):
-    return float(np.sqrt(solution.covariance[solution.order.index(name)][
-        solution.order.index(name)
-    ]))  # fmt: skip
+    i = solution.order.index(name)
+    return float(np.sqrt(solution.covariance[i][i]))
 
 
 def test_a_stated_window_costs_no_precision_and_a_window_of_none_is_left_alone():
@@ -94,9 +99,7 @@ def test_a_stamp_at_the_end_is_half_a_window_late():
 
 
 def test_single_beams_average_too():
-    plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
-    for axis in ("roll", "pitch"):
-        plan["sway"][axis][0]["frequency_hz"] = SWELL_HZ
+    plan = plan_in_swell()
     del plan["dvl"], plan["trial"]["dvl"]
     plan["dvl_beams"] = {
         "rate_hz": 5,
