@@ -104,7 +104,7 @@ class BoundObservation:
         index = np.array([i])
         whole = self.observation
         own = whole.some(index) if isinstance(whole, ObservationByRows) else None
-        chain = self.chain.from_node(int(self.attachment.node[i]))
+        chain = self.chain.from_node(self.chain.nodes_at(self.attachment)[i])
         errors = self.errors
         return replace(
             self,
@@ -134,16 +134,6 @@ class BoundObservation:
         of_chain = (self.chain.clock, self.chain.attitude_clock)
         return {*parameters_of(self.observation), *ERRORS, *of_chain}
 
-    @property
-    def turning(self) -> bool:
-        """Whether it hangs where its attitude is: as attitudes do, and what moves with the nodes.
-
-        Nothing is known less well than what is carried beyond the nodes.
-        """
-        clock, own = self.observation.clock, self.chain.attitude_clock
-        with_nodes = clock is not None and clock.names[0] == self.chain.clock
-        return own is not None and (with_nodes or self.observation.unit == _ANGLE)
-
     def times(self, parameters: Mapping[str, Array]) -> Array:
         """Return when measurements were made by clocks as they are, (M,), s, by that of nodes."""
         return time_on_chain(self.observation, parameters, self.clock_zero, self.chain.clock)
@@ -154,10 +144,14 @@ class BoundObservation:
         return self.chain.attach(
             self.times(parameters),
             shift,
-            turning=self.turning,
-            before=self.attachment,
-            window=self.window(parameters),
+            self.window(parameters),
+            of_attitude=self.of_attitude,
         )
+
+    @property
+    def of_attitude(self) -> bool:
+        """Whether it measures attitude alone."""
+        return self.observation.unit == _ANGLE
 
     def window(self, parameters: Mapping[str, Array]) -> float | None:
         """Return the length of the window that measurements are means over, s; None = of none."""
@@ -313,12 +307,13 @@ class BoundObservation:
     def nodes(self, processes: Processes) -> IntArray:
         """Return the nodes of each measurement: of the chain, and before in each process."""
         before = [p.place(self.observation.time)[0] for p in processes.all]
-        return np.column_stack([self.attachment.node, *before])
+        return np.column_stack([self.chain.nodes_at(self.attachment), *before])
 
     def keys_at(self, nodes: IntArray, processes: Processes, shared: Sequence[int]) -> IntArray:
         """Return the variables of measurements at nodes as of `nodes`, `shared` ones last."""
-        out = [*self.chain.variables(nodes[:, 0])]
-        for process, before in zip(processes.all, nodes.T[1:], strict=True):
+        of_chain = nodes.shape[1] - len(processes.all)
+        out = [*self.chain.variables(nodes[:, :of_chain])]
+        for process, before in zip(processes.all, nodes.T[of_chain:], strict=True):
             out += [process.key(0) + before, process.key(0) + before + 1]
         out += [np.full(len(nodes), key) for key in shared]
         return np.column_stack(out)

@@ -8,9 +8,7 @@ from typing import Any, Protocol
 
 import gtsam
 
-from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.priors import ConstantsPrior
@@ -59,19 +57,11 @@ class ChainStates(Protocol):
         """Velocity over ground in n, (K, 3), m/s."""
 
 
-class Attached(Protocol):
-    """Where M times hang on a chain."""
-
-    @property
-    def node(self) -> IntArray:
-        """Node before each, (M,)."""
-
-
 class Chain(Protocol):
     """Nodes, what ties them to each other, and the motion in between.
 
-    Each node has a navigation state, attitude, position and velocity in GTSAM's tangent space of
-    `NavState`, and may have a second variable.
+    Each node has a navigation state, attitude, position and velocity, in one variable or two, and
+    may have others.
     """
 
     @property
@@ -118,7 +108,7 @@ class Chain(Protocol):
         """Dimensions of the variables of a measurement, as `variables` has them."""
 
     @property
-    def joints(self) -> range:
+    def joints(self) -> Sequence[int]:
         """Nodes between which branches lie: eliminated last, they leave each by itself."""
 
     def part(self, block: slice) -> Chain:
@@ -136,11 +126,11 @@ class Chain(Protocol):
     def states(self, values: gtsam.Values) -> Any:
         """Return states as arrays."""
 
-    def states_around(self, values: gtsam.Values, k: int) -> Any:
-        """Return the states that measurements after node k depend on."""
+    def states_around(self, values: gtsam.Values, nodes: IntArray) -> Any:
+        """Return the states that measurements after nodes (c,) depend on."""
 
-    def from_node(self, k: int) -> Chain:
-        """Return what carries the motion of measurements after node k, taken as the first."""
+    def from_node(self, nodes: IntArray) -> Chain:
+        """Return what carries the motion of measurements after nodes (c,), taken as the first."""
 
     def add_prior(
         self,
@@ -155,21 +145,6 @@ class Chain(Protocol):
         """Yield its own parameters with their means over the trial, and the derivatives of these.
 
         In reported units; derivatives by the variables of the graph, by key.
-        """
-
-    def trajectory(self, states: Any, P: Array, body_axes: BodyAxes, rate_hz: float) -> Trajectory:
-        """Return the motion at a rate, with its covariance.
-
-        Parameters
-        ----------
-        states : object
-            States of the K nodes.
-        P : ndarray, shape (K, 9, 9)
-            Their covariances, in GTSAM's tangent space.
-        body_axes : BodyAxes
-            Axes of the body.
-        rate_hz : float
-            Epochs in a second.
         """
 
     def release(self) -> None:
@@ -199,10 +174,9 @@ class Chain(Protocol):
         self,
         time: Array,
         shift: float = 0.0,
-        *,
-        turning: bool = False,
-        before: Any = None,
         window: float | None = None,
+        *,
+        of_attitude: bool = False,
     ) -> Any:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest.
 
@@ -212,14 +186,11 @@ class Chain(Protocol):
             Times by the clock of the nodes.
         shift : float, default 0, s
             Shift of the clock of attitudes beside it.
-        turning : bool, default False
-            Whether they hang between the nodes that their attitude is between, as measurements of
-            attitude do, and those that move with the nodes.
-        before : object, optional
-            Where they hung.
         window : float, optional, s
             Length of windows about the times, of measurements that are means. A chain without
             samples, and one that carries the motion forward only, leave it out.
+        of_attitude : bool, default False
+            Whether they are measurements of attitude alone: the track counts for nothing.
         """
 
     def missing(self, at: Any, lin: Linearization) -> Array | None:
@@ -253,5 +224,14 @@ class Chain(Protocol):
     def steps(self, states: Any) -> Iterator[StepRows]:
         """Yield the whitened rows from node to node that are not in `graph`, some at a time."""
 
-    def variables(self, node: IntArray) -> list[IntArray]:
-        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
+    def state_keys(self, k: int) -> list[int]:
+        """Return the keys of the state of node k: of all, or of attitude and of the rest."""
+
+    def nodes_at(self, at: Any) -> IntArray:
+        """Return the nodes before M attached times, (M, c): of all, or of each part of states."""
+
+    def variables(self, nodes: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M, c), (M,) each.
+
+        Of nodes (M, 1), all parts of states are those of the same node.
+        """

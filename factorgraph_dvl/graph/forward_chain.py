@@ -46,10 +46,9 @@ class ForwardChain(InertialChain):
         self,
         time: Array,
         shift: float = 0.0,
-        *,
-        turning: bool = False,
-        before: Any = None,
         window: float | None = None,
+        *,
+        of_attitude: bool = False,
     ) -> Any:
         """Return where times (M,) hang on the chain; beyond it, to first order from its edge."""
         rate = self.frame.earth_rate
@@ -72,9 +71,9 @@ class ForwardChain(InertialChain):
         """Return the derivative of residuals by state and bias at the nodes, (M, d, 15)."""
         return node_jacobian(lin, transition)
 
-    def variables(self, node: IntArray) -> list[IntArray]:
-        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
-        return super().variables(node)[:2]
+    def variables(self, nodes: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M, 1), (M,) each."""
+        return super().variables(nodes)[:2]
 
     def errors(
         self, parameters: Sequence[Parameter], key_of: Mapping[str, int]

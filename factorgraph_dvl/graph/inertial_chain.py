@@ -200,12 +200,14 @@ class InertialChain:
         """Return states and biases as arrays."""
         return self._states(values, range(self.node_time.size))
 
-    def states_around(self, values: gtsam.Values, k: int) -> States:
-        """Return the states that measurements after node k depend on: its own, and the next."""
+    def states_around(self, values: gtsam.Values, nodes: IntArray) -> States:
+        """Return the states that measurements after a node (1,) depend on: of it and the next."""
+        (k,) = nodes.tolist()
         return self._states(values, range(k, k + 2))
 
-    def from_node(self, k: int) -> Self:
-        """Return what carries the motion from node k to the next, which then are the first two."""
+    def from_node(self, nodes: IntArray) -> Self:
+        """Return what carries the motion from a node (1,) to the next: they are the first two."""
+        (k,) = nodes.tolist()
         seg = self.segments
         i = int(np.searchsorted(seg.origin, k))
         own = replace(
@@ -243,10 +245,9 @@ class InertialChain:
         self,
         time: Array,
         shift: float = 0.0,
-        *,
-        turning: bool = False,
-        before: TwoWay | None = None,
         window: float | None = None,
+        *,
+        of_attitude: bool = False,
     ) -> TwoWay:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         return attach_two_way(self.segments, time, self.frame.earth_rate, window)
@@ -276,8 +277,17 @@ class InertialChain:
         """Return the derivative of residuals by the variables of measurements, (M, d, n)."""
         return two_way_jacobian(lin, transition, walking=self.walking)
 
-    def variables(self, node: IntArray) -> list[IntArray]:
-        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
+    def state_keys(self, k: int) -> list[int]:
+        """Return the key of the state of node k."""
+        return [keys.node(k)]
+
+    def nodes_at(self, at: TwoWay) -> IntArray:
+        """Return the nodes before attached times, (M, 1)."""
+        return at.node[:, None]
+
+    def variables(self, nodes: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M, 1), (M,) each."""
+        node = nodes[:, 0]
         before = [keys.nodes(node), keys.bias(0) + self.walking * node]
         after = [keys.nodes(node + 1), keys.bias(0) + self.walking * (node + 1)]
         return [*before, *(after if self.walking else after[:1])]

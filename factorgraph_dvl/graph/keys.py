@@ -6,24 +6,24 @@ import string
 from collections.abc import Iterable
 
 from gtsam import Ordering, symbol, symbolChr, symbolIndex
-from gtsam.symbol_shorthand import B, W, X
+from gtsam.symbol_shorthand import B, R, W, X
 
 from factorgraph_dvl.geometry.vectors import IntArray
 
-# Chosen: all letters but those of states, biases and rates.
-_LETTERS = [c for c in string.ascii_letters + string.digits if c not in "bwx"]
+# Chosen: all letters but those of states, biases, attitudes and rates.
+_LETTERS = [c for c in string.ascii_letters + string.digits if c not in "brwx"]
 # Letters of correlated errors. Chosen: what no other variable has.
 _PROCESSES = string.punctuation
 
 # Keys with the index 0; the others follow. By GTSAM's definition.
 _FIRST_NODE = int(X(0))
 _FIRST_BIAS = int(B(0))
+_FIRST_ATTITUDE = int(R(0))
 _FIRST_RATE = int(W(0))
 # Dimensions of a state, attitude, position and velocity, and of the biases of accelerometers and
-# gyros: those of GTSAM's NavState and ConstantBias. Of the angular rates of a state without IMU.
+# gyros: those of GTSAM's NavState and ConstantBias.
 STATE_SIZE = 9
 BIAS_SIZE = 6
-RATE_SIZE = 3
 
 
 def node(k: int) -> int:
@@ -39,6 +39,11 @@ def nodes(k: IntArray) -> IntArray:
 def bias(k: int) -> int:
     """Return the key of IMU bias k."""
     return _FIRST_BIAS + k
+
+
+def attitude(k: int) -> int:
+    """Return the key of the attitude at node k, where it is a variable of its own."""
+    return _FIRST_ATTITUDE + k
 
 
 def rate(k: int) -> int:

@@ -102,12 +102,13 @@ def _measurement_factor(
     shared = [problem.key(p.name) for p in parameters]
     every = bound.keys_at(bound.nodes(processes)[[i]], processes, shared)[0].tolist()
     wanted = [p.name for p in parameters]
-    k, rows = int(bound.attachment.node[i]), bound.weight.shape[1]
+    nodes = problem.chain.nodes_at(bound.attachment)[i]
+    rows = bound.weight.shape[1]
     parameters_at = _parameters_at(problem, every)
 
     def linearize(at: gtsam.Values) -> tuple[Array, Array]:
         values = parameters_at(at)
-        states = problem.chain.states_around(at, k)
+        states = problem.chain.states_around(at, nodes)
         single.attach(values)
         motion = single.motion(single.attachment, states, values)
         lin = single.linearized(motion, values, wanted, processes)
@@ -123,15 +124,16 @@ def _step_factors(problem: WholeProblem) -> Iterator[gtsam.CustomFactor]:
     """Yield the factors from node to node that GTSAM does not have, one for each step."""
     chain = problem.chain
     for k in range(chain.count if chain.interpolates else 0):
-        every = [int(each[0]) for each in chain.variables(np.array([k]))]
+        every = [int(each[0]) for each in chain.variables(np.array([[k]]))]
         yield _step_factor(chain, k, every)
 
 
 def _step_factor(chain: Chain, k: int, every: Sequence[int]) -> gtsam.CustomFactor:
-    local = chain.from_node(k)
+    node = np.array([k])
+    local = chain.from_node(node)
 
     def linearize(at: gtsam.Values) -> tuple[Array, Array]:
-        (step,) = local.steps(chain.states_around(at, k))
+        (step,) = local.steps(chain.states_around(at, node))
         return step.residual[0], step.by_nodes[0]
 
     return custom_factor(every, chain.sizes, sum(chain.sizes) // 2, linearize)

@@ -230,8 +230,17 @@ class PlanarChain:
         """Return the keys of the states of nodes."""
         return [keys.node(k) for k in nodes]
 
-    def variables(self, node: IntArray) -> list[IntArray]:
-        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
+    def state_keys(self, k: int) -> list[int]:
+        """Return the key of the state of node k."""
+        return [keys.node(k)]
+
+    def nodes_at(self, at: Attached) -> IntArray:
+        """Return the nodes before attached times, (M, 1)."""
+        return at.node[:, None]
+
+    def variables(self, nodes: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes (M, 1), (M,) each."""
+        node = nodes[:, 0]
         return [keys.nodes(node), keys.nodes(node + 1)]
 
     def values(self, states: PlanarStates) -> gtsam.Values:
@@ -245,8 +254,9 @@ class PlanarChain:
         """Return states as arrays."""
         return self._states(values, range(self.node_time.size))
 
-    def states_around(self, values: gtsam.Values, k: int) -> PlanarStates:
-        """Return the states that measurements after node k depend on."""
+    def states_around(self, values: gtsam.Values, nodes: IntArray) -> PlanarStates:
+        """Return the states that measurements after a node (1,) depend on."""
+        (k,) = nodes.tolist()
         return self._states(values, range(k, k + 2))
 
     def _states(self, values: gtsam.Values, nodes: range) -> PlanarStates:
@@ -258,8 +268,9 @@ class PlanarChain:
         nRb, p_n, v_n = self._in_space(time, x)
         return PlanarStates(time, x, nRb, p_n, v_n)
 
-    def from_node(self, k: int) -> PlanarChain:
-        """Return what carries the motion from node k to the next, which then are the first two."""
+    def from_node(self, nodes: IntArray) -> PlanarChain:
+        """Return what carries the motion from a node (1,) to the next: they are the first two."""
+        (k,) = nodes.tolist()
         return replace(
             self,
             node_time=self.node_time[k : k + 2],
@@ -280,10 +291,9 @@ class PlanarChain:
         self,
         time: Array,
         shift: float = 0.0,
-        *,
-        turning: bool = False,
-        before: Attached | None = None,
         window: float | None = None,
+        *,
+        of_attitude: bool = False,
     ) -> Attached:
         """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
         time = np.clip(time, self.node_time[0], self.node_time[-1])

@@ -381,7 +381,7 @@ class Problem:
         out = []
         for bound in self._bound:
             window = bound.window(parameters)
-            own = (bound.turning, shift, bound.times(parameters).tobytes(), window)
+            own = (bound.of_attitude, shift, bound.times(parameters).tobytes(), window)
             if own not in found:
                 at = self._attachments.get(own)
                 found[own] = bound.attached(parameters) if at is None else at
@@ -572,7 +572,10 @@ class Problem:
             for bound in block.bound:
                 at = evaluation.attached[self._bound.index(bound)]
                 before, bound.attachment = bound.attachment, at
-                if before is None or not (at is before or np.array_equal(at.node, before.node)):
+                if before is None or not (
+                    at is before
+                    or np.array_equal(self.chain.nodes_at(at), self.chain.nodes_at(before))
+                ):
                     block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
 
     def _fill(self, evaluation: Evaluation) -> None:
@@ -710,7 +713,7 @@ class Problem:
         """Yield the rows from node to node that GTSAM does not linearise itself."""
         for step in self.chain.steps(evaluation.states):
             node = np.arange(step.first, step.first + len(step.residual))
-            variables = np.column_stack(self.chain.variables(node))
+            variables = np.column_stack(self.chain.variables(node[:, None]))
             yield Rows(
                 step.source,
                 step.components,

@@ -369,7 +369,7 @@ def sensor_factor(
     if not index.size:
         raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
     some = ObservationRows(observation, index)
-    bound, _ = bind(_inertial(chain).from_node(k), [some], (), {}, clock_zero)
+    bound, _ = bind(_inertial(chain).from_node(np.array([k])), [some], (), {}, clock_zero)
     measured = NodeMeasurements(tuple(bound), free, fixed)
     states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
     weight = 1.0 / measured.sigma(measured.motions(states, given), given, {})

@@ -10,25 +10,23 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.records import concatenated
-from factorgraph_dvl.geometry.rotations import BodyAxes, log_so3
+from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.chain import StepRows
-from factorgraph_dvl.graph.keys import RATE_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, loose_diagonal
 from factorgraph_dvl.graph.smooth_motion import (
     Between,
+    Place,
     SmoothStates,
     Turns,
     interpolated,
     motion_steps,
+    place_of,
     turns_of,
     variance_between,
 )
-from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion
 
@@ -41,16 +39,15 @@ _COMPONENTS = tuple(
     for kind in ("turn", "shift", "angular acceleration", "acceleration")
     for axis in "xyz"
 )
-# Standard deviations of the first state, rad, m, m/s and rad/s. Chosen: they only keep the chain
+# Standard deviations of the first state, rad, rad/s, m and m/s. Chosen: they only keep the chain
 # regular.
-_FREE = np.repeat([np.pi, 1e5, 1e2, 1.0], 3)
+_FREE = np.repeat([np.pi, 1.0, 1e5, 1e2], 3)
+# Dimensions of attitude, rates and track, which is position and velocity in n.
+_TURN, _RATE, _TRACK = 3, 3, 6
 # Nodes of a branch, as of the inertial chain.
 _BRANCH = 128
 # What rounding may add to a time, s.
 _ROUNDING = 1e-6
-# Share of the time between nodes by which a measurement may be beyond its own. Chosen: a clock
-# that is nearly known moves less.
-_STAYS = 0.05
 # Steps whose rows are made at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 
@@ -61,18 +58,17 @@ class Attached:
 
     Parameters
     ----------
-    node : ndarray of int, shape (M,)
-        Node before.
-    segment : ndarray of int, shape (M,)
-        The same: segments are from node to node.
-    time, turned : ndarray, shape (M,), s
-        Times by the clock of the nodes, and by that of their attitudes.
+    place, turned : Place
+        Where position and velocity are between nodes, and where attitude and rate are.
     """
 
-    node: IntArray
-    segment: IntArray
-    time: Array
-    turned: Array
+    place: Place
+    turned: Place
+
+    @property
+    def segment(self) -> IntArray:
+        """The segment from node to node that each is in; the first of two, (M,)."""
+        return np.minimum(self.place.node, self.turned.node)
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ class ChainStates(SmoothStates):
     Parameters
     ----------
     time : ndarray, shape (K,), s
-        Times of the nodes.
+        Times of the attitudes of the nodes.
     """
 
     time: Array
@@ -97,25 +93,29 @@ class ChainStates(SmoothStates):
 class SmoothChain:
     """Nodes of a trial without IMU, and the prior of their motion.
 
+    Position and velocity of a node are at its time by one clock, attitude and rate at another by
+    the clock of attitudes: a measurement hangs between the nodes that each of both is between, and
+    may pass nodes of either as clocks move.
+
     Parameters
     ----------
     frame : LocalFrame
         Tangent frame n.
     node_time : ndarray, shape (K,), s
         Times of the nodes, by `clock`.
+    attitude_time : ndarray, shape (K,), s
+        Times of their attitudes and rates, by `attitude_clock`; as far from each other.
     density : ndarray, shape (K - 1, 6)
         Power spectral densities of the acceleration between nodes, as of `motion_steps`.
     start : SmoothStates
         States about which the prior of the first is loose.
     nRt : ndarray, shape (K, 3, 3)
         Axes of the track to n: level, they turn with the heading but not with waves.
-    clock : str, optional
-        Name of the time offset of the clock that the nodes have; None = true times.
-    attitude_clock : str, optional
+    attitude_clock : str
         Name of the time offset of the clock that their attitudes have: measurements of attitude
         then stay where they are between nodes whatever the clocks.
-    first_shift : float, default 0, s
-        By how much that clock was late where both agree with the times of the nodes.
+    clock : str, optional
+        Name of the time offset of the clock that the nodes have; None = true times.
     resolution : float, default 0, s
         Interval of the densest record: a trajectory has no more epochs.
     block : slice, optional
@@ -124,12 +124,12 @@ class SmoothChain:
 
     frame: LocalFrame
     node_time: Array
+    attitude_time: Array
     density: Array
     start: SmoothStates
     nRt: Array
+    attitude_clock: str
     clock: str | None = None
-    attitude_clock: str | None = None
-    first_shift: float = 0.0
     resolution: float = 0.0
     block: slice | None = None
     interpolates: ClassVar[bool] = True
@@ -144,6 +144,11 @@ class SmoothChain:
     def duration(self) -> float:
         """How long the motion is known, s."""
         return float(self.node_time[-1] - self.node_time[0])
+
+    @property
+    def attitude_shift(self) -> float:
+        """Times of attitudes less those of the nodes, s."""
+        return float(self.attitude_time[0] - self.node_time[0])
 
     @property
     def log_determinant(self) -> float:
@@ -161,10 +166,12 @@ class SmoothChain:
         graph = gtsam.NonlinearFactorGraph()
         if self.block is None or self.block.start == 0:
             s = self.start
-            state = gtsam.NavState(gtsam.Rot3(s.nRb[0]), s.p_n[0], s.v_n[0])
-            loose = loose_diagonal(_FREE[:STATE_SIZE])
-            graph.add(gtsam.PriorFactorNavState(keys.node(0), state, loose))
-            graph.addPriorVector(keys.rate(0), s.omega_b[0], loose_diagonal(_FREE[STATE_SIZE:]))
+            turn, rate, track = (
+                loose_diagonal(each) for each in np.split(_FREE, [_TURN, _TURN + _RATE])
+            )
+            graph.add(gtsam.PriorFactorRot3(keys.attitude(0), gtsam.Rot3(s.nRb[0]), turn))
+            graph.addPriorVector(keys.rate(0), s.omega_b[0], rate)
+            graph.addPriorVector(keys.node(0), np.append(s.p_n[0], s.v_n[0]), track)
         return graph
 
     @property
@@ -175,12 +182,16 @@ class SmoothChain:
     @property
     def sizes(self) -> list[int]:
         """Dimensions of the variables of a measurement."""
-        return [STATE_SIZE, RATE_SIZE] * 2
+        return [_TURN, _RATE, _TURN, _RATE, _TRACK, _TRACK]
 
     @property
-    def joints(self) -> range:
-        """Nodes between which branches lie: eliminated last, they leave each by itself."""
-        return range(0, self.node_time.size, _BRANCH)
+    def joints(self) -> list[int]:
+        """Nodes between which branches lie: eliminated last, they leave each by itself.
+
+        Two at a time: a measurement may hang on the track after a node, and on attitudes before.
+        """
+        first = range(_BRANCH, self.node_time.size - 1, _BRANCH)
+        return [k + i for k in first for i in (0, 1)]
 
     def part(self, block: slice) -> SmoothChain:
         """Return the part of some steps in a row; states keep their keys."""
@@ -194,59 +205,83 @@ class SmoothChain:
         return range(block.start, block.stop + (block.stop == self.count))
 
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
-        """Return the keys of the states of nodes, each with that of its rates."""
-        return [key for k in nodes for key in (keys.node(k), keys.rate(k))]
+        """Return the keys of the attitudes of nodes, each with those of its rates and track."""
+        return [key for k in nodes for key in (keys.attitude(k), keys.rate(k), keys.node(k))]
 
-    def variables(self, node: IntArray) -> list[IntArray]:
-        """Return the keys of the variables of measurements after nodes (M,), (M,) each."""
-        return [first + k for k in (node, node + 1) for first in (keys.node(0), keys.rate(0))]
+    def state_keys(self, k: int) -> list[int]:
+        """Return the keys of attitude, and of position and velocity, of node k."""
+        return [keys.attitude(k), keys.node(k)]
+
+    def nodes_at(self, at: Attached) -> IntArray:
+        """Return the nodes before attached times, of the track and of the attitude, (M, 2)."""
+        return np.column_stack([at.place.node, at.turned.node])
+
+    def variables(self, nodes: IntArray) -> list[IntArray]:
+        """Return the keys of the variables of measurements after nodes, (M,) each.
+
+        Nodes (M, 2) are those of `nodes_at`, or (M, 1) where both are the same.
+        """
+        node, turned = nodes[:, 0], nodes[:, -1]
+        of_turn = [
+            first + k for k in (turned, turned + 1) for first in (keys.attitude(0), keys.rate(0))
+        ]
+        return [*of_turn, keys.nodes(node), keys.nodes(node + 1)]
 
     @cached_property
     def zeros(self) -> gtsam.Values:
         """States and rates of zero: they take GTSAM far longer to insert than to move."""
-        out, state = gtsam.Values(), gtsam.NavState()
+        out, turn = gtsam.Values(), gtsam.Rot3()
         for k in range(self.node_time.size):
-            out.insert(keys.node(k), nav_state=state)
-            out.insert(keys.rate(k), np.zeros(RATE_SIZE))
+            out.insert(keys.attitude(k), rot3=turn)
+            out.insert(keys.rate(k), np.zeros(_RATE))
+            out.insert(keys.node(k), np.zeros(_TRACK))
         return out
 
     def values(self, states: SmoothStates) -> gtsam.Values:
         """Return GTSAM's values of states and rates."""
         step = gtsam.VectorValues()
-        rows = np.hstack([log_so3(states.nRb), states.p_n, states.v_n])
-        for k, (row, rate) in enumerate(zip(rows, states.omega_b, strict=True)):
-            step.insert(keys.node(k), row)
+        tracks = np.hstack([states.p_n, states.v_n])
+        rows = zip(log_so3(states.nRb), states.omega_b, tracks, strict=True)
+        for k, (turn, rate, track) in enumerate(rows):
+            step.insert(keys.attitude(k), turn)
             step.insert(keys.rate(k), rate)
+            step.insert(keys.node(k), track)
         return self.zeros.retract(step)
 
     def states(self, values: gtsam.Values) -> ChainStates:
         """Return states as arrays."""
-        return self._states(values, range(self.node_time.size))
+        every = range(self.node_time.size)
+        return self._states(values, every, every)
 
-    def states_around(self, values: gtsam.Values, k: int) -> ChainStates:
-        """Return the states that measurements after node k depend on."""
-        return self._states(values, range(k, k + 2))
+    def states_around(self, values: gtsam.Values, nodes: IntArray) -> ChainStates:
+        """Return the states that measurements after nodes (2,) or (1,) depend on."""
+        node, turned = int(nodes[0]), int(nodes[-1])
+        return self._states(values, range(node, node + 2), range(turned, turned + 2))
 
-    def from_node(self, k: int) -> SmoothChain:
-        """Return what carries the motion from node k to the next, which then are the first two."""
-        two = slice(k, k + 2)
+    def from_node(self, nodes: IntArray) -> SmoothChain:
+        """Return what carries the motion from nodes (2,) or (1,) to the next: the first two."""
+        node, turned = int(nodes[0]), int(nodes[-1])
+        two = slice(node, node + 2)
         return replace(
             self,
             node_time=self.node_time[two],
-            density=self.density[k : k + 1],
+            attitude_time=self.attitude_time[turned : turned + 2],
+            density=np.append(self.density[turned, :3], self.density[node, 3:])[None],
             nRt=self.nRt[two],
             block=None,
         )
 
-    def _states(self, values: gtsam.Values, nodes: range) -> ChainStates:
-        state, omega = np.empty((len(nodes), 5, 5)), np.empty((len(nodes), RATE_SIZE))
-        for i, k in enumerate(nodes):
-            # A matrix of GTSAM's is [nRb, p, v; 0, I].
-            state[i] = values.atNavState(keys.node(k)).matrix()
+    def _states(self, values: gtsam.Values, nodes: range, turned: range) -> ChainStates:
+        nRb, omega = np.empty((len(turned), 3, 3)), np.empty((len(turned), _RATE))
+        track = np.empty((len(nodes), _TRACK))
+        for i, k in enumerate(turned):
+            nRb[i] = values.atRot3(keys.attitude(k)).matrix()
             omega[i] = values.atVector(keys.rate(k))
-        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
-        some = slice(nodes.start, nodes.stop)
-        return ChainStates(nRb, p_n, v_n, omega, self.node_time[some])
+        for i, k in enumerate(nodes):
+            track[i] = values.atVector(keys.node(k))
+        p_n, v_n = track[:, :3].copy(), track[:, 3:].copy()
+        time = self.attitude_time[turned.start : turned.stop]
+        return ChainStates(nRb, p_n, v_n, omega, time)
 
     def covers(self, time: Array) -> BoolArray:
         """Whether times (M,) are between the first node and the last but one.
@@ -258,35 +293,23 @@ class SmoothChain:
 
     def shift(self, parameters: Mapping[str, Array]) -> float:
         """Return by how much its clock of attitudes is late beside that of the nodes, s."""
-        if self.attitude_clock is None:
-            return 0.0
         lag = 0.0 if self.clock is None else float(parameters[self.clock][0])
-        return float(parameters[self.attitude_clock][0]) - lag - self.first_shift
+        return float(parameters[self.attitude_clock][0]) - lag
 
     def attach(
         self,
         time: Array,
         shift: float = 0.0,
-        *,
-        turning: bool = False,
-        before: Attached | None = None,
         window: float | None = None,
+        *,
+        of_attitude: bool = False,
     ) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
-
-        A measurement that is hardly beyond the nodes it had `before` keeps them: its attitude is
-        carried from other nodes than its position, so that the cost would jump there, by some
-        thousandths, and a minimisation would end at the jump.
-        """
-        turned = time + shift
-        by = turned if turning else time
-        node = np.searchsorted(self.node_time, by, side="right") - 1
-        node = np.clip(node, 0, self.count - 1)
-        if before is not None:
-            begin, end = self.node_time[before.node], self.node_time[before.node + 1]
-            slack = _STAYS * (end - begin)
-            node = np.where((by > begin - slack) & (by < end + slack), before.node, node)
-        return Attached(node, node, time, turned)
+        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        turned = place_of(time + shift, self.attitude_time)
+        if not of_attitude:
+            return Attached(place_of(time, self.node_time), turned)
+        # By the same nodes of the track: others would only fill the information matrix.
+        return Attached(replace(turned, tau=time - self.node_time[turned.node]), turned)
 
     def missing(self, at: Attached, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
@@ -296,14 +319,15 @@ class SmoothChain:
         """
         if lin.d_p is None and lin.d_v is None and lin.d_omega is None:
             return None
-        begin, span = self.node_time[at.node], np.diff(self.node_time)[at.node]
-        density, axes = self.density[at.node], self.nRt[at.node]
+        axes = self.nRt[at.place.node]
+        turning, moving = self.density[at.turned.node, :3], self.density[at.place.node, 3:]
         out = np.zeros_like(lin.residual)
-        for time, q, by_value, by_rate in (
-            (at.turned, density[:, :3], lin.d_theta, lin.d_omega),
-            (at.time, density[:, 3:], _turned(lin.d_p, axes), _turned(lin.d_v, axes)),
+        for place, q, by_value, by_rate in (
+            (at.turned, turning, lin.d_theta, lin.d_omega),
+            (at.place, moving, _turned(lin.d_p, axes), _turned(lin.d_v, axes)),
         ):
-            of_value, of_both, of_rate = variance_between(time - begin, span)[..., None, None]
+            variances = variance_between(place.tau, place.span)
+            of_value, of_both, of_rate = variances[..., None, None]
             variance = np.zeros((*out.shape, 3))
             if by_value is not None:
                 variance = variance + of_value * by_value**2
@@ -322,7 +346,7 @@ class SmoothChain:
         self, at: Attached, states: ChainStates, motion: Motion | None = None
     ) -> Between:
         """Return the motion at attached times, from which derivatives by the nodes follow."""
-        return interpolated(states.turns, states.time, states, at.node, at.time, at.turned)
+        return interpolated(states.turns, states, at.place, at.turned)
 
     def node_jacobian(self, lin: Linearization, transition: Between) -> Array:
         """Return the derivative of residuals by the variables of measurements, (M, d, 24)."""
@@ -335,9 +359,13 @@ class SmoothChain:
             last = min(first + _CHUNK, block.stop)
             nodes = slice(first, last + 1)
             some = SmoothStates(*(getattr(states, name)[nodes] for name in _OF_STATE))
-            turns = turns_of(self.node_time[nodes], some)
+            turns = turns_of(self.attitude_time[nodes], some)
             found = motion_steps(turns, some, self.nRt[nodes], self.density[first:last])
-            by_nodes = np.concatenate([found.before, found.after], axis=2)
+            of_turn = slice(0, _TURN + _RATE), slice(_TURN + _RATE, None)
+            by_nodes = np.concatenate(
+                [each[:, :, own] for own in of_turn for each in (found.before, found.after)],
+                axis=2,
+            )
             yield StepRows(MOTION, _COMPONENTS, first, found.residual, by_nodes)
 
     def add_prior(
@@ -358,44 +386,6 @@ class SmoothChain:
 
     def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
         """Return None: there is no IMU."""
-
-    def trajectory(
-        self,
-        states: ChainStates,
-        P: Array,
-        body_axes: BodyAxes,
-        rate_hz: float,
-        lag: float = 0.0,
-    ) -> Trajectory:
-        """Return the motion at a rate, with its covariance.
-
-        Parameters
-        ----------
-        states : ChainStates
-            States of the K nodes.
-        P : ndarray, shape (K, 9, 9)
-            Their covariances at true times, in GTSAM's tangent space.
-        body_axes : BodyAxes
-            Axes of the body.
-        rate_hz : float
-            Epochs in a second, at most those of the densest record.
-        lag : float, default 0, s
-            By how much the clock of the nodes is late.
-        """
-        rate_hz = min(rate_hz, 1.0 / self.resolution if self.resolution else rate_hz)
-        first, last = self.node_time[[0, -1]] - lag
-        time = epochs_between(first, last, rate_hz)
-        P_n = tangent_in_n(P, states.nRb)
-        parts = []
-        for i in range(0, max(time.size, 1), _CHUNK):
-            some = time[i : i + _CHUNK]
-            at = self.attach(some + lag)
-            found = self.transition(at, states)
-            span = np.diff(self.node_time)[at.node]
-            fraction = (at.time - self.node_time[at.node]) / span
-            covariance = between(P_n, at.node, fraction) + found.missing(self.density, self.nRt)
-            parts.append(reported(some, found.motion, covariance, self.frame, body_axes))
-        return parts[0] if len(parts) == 1 else concatenated(parts)
 
     def release(self) -> None:
         """Free nothing: nothing is kept for binding measurements."""

@@ -51,13 +51,13 @@ class SmoothStates:
     def retracted(self, delta: Array) -> SmoothStates:
         """Return the states after a step (K, 12) in the tangent space.
 
-        nRb Exp(theta), p_n + nRb dp, v_n + nRb dv, omega_b + d omega, as GTSAM's NavState.
+        nRb Exp(theta), omega_b + d omega, p_n + dp, v_n + dv.
         """
         return SmoothStates(
             self.nRb @ exp_so3(delta[:, :3]),
-            self.p_n + rotate(self.nRb, delta[:, 3:6]),
-            self.v_n + rotate(self.nRb, delta[:, 6:9]),
-            self.omega_b + delta[:, 9:],
+            self.p_n + delta[:, 6:9],
+            self.v_n + delta[:, 9:],
+            self.omega_b + delta[:, 3:6],
         )
 
 
@@ -155,20 +155,19 @@ def motion_steps(turns: Turns, states: SmoothStates, nRt: Array, density: Array)
     )
     residual = np.concatenate([w_gg * moved, w_rg * moved + w_rr * change], axis=1)
     inverse, left, one = turns.inverse, turns.inverse.transpose(0, 2, 1), np.eye(3)[None]
-    span, bRn = dt[:, None, None], states.nRb
-    tRb = tRn @ bRn
+    span = dt[:, None, None]
     # By first row and column: derivatives of `moved` and of `change`.
     of_before = {
         (0, 0): (-left, -turns.bend @ left),
-        (0, 9): (-span * one, -one),
-        (3, 3): (-to_shift @ bRn[:-1], None),
-        (3, 6): (-span * tRb[:-1], -tRb[:-1]),
+        (0, 3): (-span * one, -one),
+        (3, 6): (-to_shift, None),
+        (3, 9): (-span * tRn[:-1], -tRn[:-1]),
     }
     of_after = {
         (0, 0): (inverse, turns.bend @ inverse),
-        (0, 9): (None, inverse),
-        (3, 3): (to_shift @ bRn[1:], None),
-        (3, 6): (None, tRb[1:]),
+        (0, 3): (None, inverse),
+        (3, 6): (to_shift, None),
+        (3, 9): (None, tRn[1:]),
     }
     before, after = np.zeros((2, dt.size, 12, 12))
     for out, parts in ((before, of_before), (after, of_after)):
@@ -184,17 +183,41 @@ def motion_steps(turns: Turns, states: SmoothStates, nRt: Array, density: Array)
 
 
 @dataclass(frozen=True)
+class Place:
+    """Where times (M,) are between nodes.
+
+    Parameters
+    ----------
+    node : ndarray of int, shape (M,)
+        The node before each, whose motion goes on where a time is not between it and the next.
+    tau : ndarray, shape (M,), s
+        Time since that node.
+    span : ndarray, shape (M,), s
+        Time from it to the next.
+    """
+
+    node: IntArray
+    tau: Array
+    span: Array
+
+
+def place_of(time: Array, nodes: Array) -> Place:
+    """Return where times (M,), s, are between nodes (K,), s; beyond these, where nearest."""
+    node = np.searchsorted(nodes, time, side="right") - 1
+    node = np.clip(node, 0, nodes.size - 2)
+    return Place(node, time - nodes[node], nodes[node + 1] - nodes[node])
+
+
+@dataclass(frozen=True)
 class Between:
     """Motion at M times between the nodes; `interpolated` makes it.
 
     Parameters
     ----------
-    node : ndarray of int, shape (M,)
-        The node before each.
+    place, turned : Place
+        Where position and velocity are between nodes, and where attitude and rate are.
     motion : Motion
         Motion at the times.
-    tau, tau_turned : ndarray, shape (M,), s
-        Time since the node before, of position and velocity, and of attitude and rate.
     gamma, rate : ndarray, shape (M, 3)
         Local variable of the attitude and its derivative in time.
     states : SmoothStates
@@ -203,32 +226,32 @@ class Between:
         Turns from node to node.
     """
 
-    node: IntArray
+    place: Place
+    turned: Place
     motion: Motion
-    tau: Array
-    tau_turned: Array
     gamma: Array
     rate: Array
     states: SmoothStates
     turns: Turns
 
     def by_nodes(self, lin: Linearization) -> Array:
-        """Return the derivatives (M, d, 24) of residuals by the tangents of both nodes."""
+        """Return the derivatives (M, d, 24) of residuals by the tangents of the nodes around.
+
+        Columns: attitude and rate at the nodes before and after `turned`, then position and
+        velocity at those before and after `place`.
+        """
         out = np.zeros((*lin.residual.shape, 24))
-        span = self.turns.span[self.node]
         if lin.d_theta is not None or lin.d_omega is not None:
-            weights = _hermite(self.tau_turned, span)[:2, :, :, None, None]
+            weights = _hermite(self.turned)[:2, :, :, None, None]
             self._add_turn(out, weights, lin.d_theta, lin.d_omega)
         if lin.d_p is not None or lin.d_v is not None:
-            weights = _hermite(self.tau, span)[:2, :, :, None, None]
+            weights = _hermite(self.place)[:2, :, :, None, None]
             parts = zip(weights, (lin.d_p, lin.d_v), strict=True)
             by_end, by_end_rate, by_rate = np.sum(
                 [w * by for w, by in parts if by is not None], axis=0
             )
-            before, after = self.states.nRb[self.node], self.states.nRb[self.node + 1]
-            by_start = -by_end if lin.d_p is None else lin.d_p - by_end
-            out[:, :, 3:6], out[:, :, 6:9] = by_start @ before, by_rate @ before
-            out[:, :, 15:18], out[:, :, 18:21] = by_end @ after, by_end_rate @ after
+            out[:, :, 12:15] = -by_end if lin.d_p is None else lin.d_p - by_end
+            out[:, :, 15:18], out[:, :, 18:21], out[:, :, 21:24] = by_rate, by_end, by_end_rate
         return out
 
     def _add_turn(
@@ -248,13 +271,14 @@ class Between:
                 by_end_rate + of_end_rate,
                 by_rate + of_rate,
             )
-        inverse = self.turns.inverse[self.node]
-        by_phi = by_end + by_end_rate @ self.turns.bend[self.node]
-        out[:, :, 12:15], out[:, :, 21:24] = by_phi @ inverse, by_end_rate @ inverse
+        node = self.turned.node
+        inverse = self.turns.inverse[node]
+        by_phi = by_end + by_end_rate @ self.turns.bend[node]
+        out[:, :, 6:9], out[:, :, 9:12] = by_phi @ inverse, by_end_rate @ inverse
         # Jl^-1 is the transpose of Jr^-1.
-        out[:, :, 0:3], out[:, :, 9:12] = -by_phi @ inverse.transpose(0, 2, 1), by_rate
+        out[:, :, 0:3], out[:, :, 3:6] = -by_phi @ inverse.transpose(0, 2, 1), by_rate
         if by_theta is not None:
-            nRb = self.states.nRb[self.node]
+            nRb = self.states.nRb[node]
             out[:, :, 0:3] += by_theta @ (self.motion.nRb.transpose(0, 2, 1) @ nRb)
 
     def missing(self, density: Array, nRt: Array) -> Array:
@@ -272,19 +296,17 @@ class Between:
         ndarray, shape (M, 3, 3, 3)
             In rad², m² and m²/s².
         """
-        span = self.turns.span[self.node]
-        of_turn = variance_between(self.tau_turned, span)[0, :, None]
-        of_value, _, of_rate = variance_between(self.tau, span)[..., None]
-        turning, moving = np.split(density[self.node], 2, axis=1)
-        axes = np.stack([self.motion.nRb, nRt[self.node], nRt[self.node]], axis=1)
+        node = self.place.node
+        of_turn = variance_between(self.turned.tau, self.turned.span)[0, :, None]
+        of_value, _, of_rate = variance_between(self.place.tau, self.place.span)[..., None]
+        turning, moving = density[self.turned.node, :3], density[node, 3:]
+        axes = np.stack([self.motion.nRb, nRt[node], nRt[node]], axis=1)
         variance = np.stack([of_turn * turning, of_value * moving, of_rate * moving], axis=1)
         return np.asarray((axes * variance[:, :, None, :]) @ axes.swapaxes(2, 3))
 
 
-def interpolated(
-    turns: Turns, time: Array, states: SmoothStates, node: IntArray, at: Array, turned: Array
-) -> Between:
-    """Return the motion at times `at` (M,), s, and the attitude at `turned`, after nodes (M,).
+def interpolated(turns: Turns, states: SmoothStates, place: Place, turned: Place) -> Between:
+    """Return the motion at M times between nodes.
 
     The position's derivative in time is the velocity, and that of the attitude the rate.
 
@@ -292,28 +314,24 @@ def interpolated(
     ----------
     turns : Turns
         Turns of the states.
-    time : ndarray, shape (K,), s
-        Times of the nodes.
     states : SmoothStates
         States at the nodes.
-    node : ndarray of int, shape (M,)
-        Nodes before, whose motion goes on where a time is not between them and the next.
-    at, turned : ndarray, shape (M,), s
-        Times of the motion by the clock of the nodes, and by that of their attitudes.
+    place, turned : Place
+        Where position and velocity are wanted between their nodes, and attitude and rate between
+        theirs, which may be others.
     """
-    tau, tau_turned = at - time[node], turned - time[node]
-    span = turns.span[node]
-    weights = _hermite(tau, span)[..., None]
-    turn = np.stack([turns.phi[node], turns.rate[node], turns.start[node]])
+    node, own = place.node, turned.node
+    weights = _hermite(place)[..., None]
+    turn = np.stack([turns.phi[own], turns.rate[own], turns.start[own]])
     move = np.stack(
         [states.p_n[node + 1] - states.p_n[node], states.v_n[node + 1], states.v_n[node]]
     )
-    of_turn = _hermite(tau_turned, span)[..., None]
+    of_turn = _hermite(turned)[..., None]
     gamma, rate, rate_of_rate = (of_turn * turn).sum(axis=1)
     shift, v_n, a_n = (weights * move).sum(axis=1)
     right = _Function(_RIGHT, gamma)
     motion = Motion(
-        nRb=states.nRb[node] @ exp_so3(gamma),
+        nRb=states.nRb[own] @ exp_so3(gamma),
         p_n=states.p_n[node] + shift,
         v_n=v_n,
         omega_eb_b=right.times(rate),
@@ -321,7 +339,7 @@ def interpolated(
         alpha_b=right.times(rate_of_rate) + right.derivative_times(rate, rate),
         omega_sigma=np.zeros_like(rate),
     )
-    return Between(node, motion, tau, tau_turned, gamma, rate, states, turns)
+    return Between(place, turned, motion, gamma, rate, states, turns)
 
 
 def variance_between(tau: Array, span: Array) -> Array:
@@ -344,11 +362,12 @@ def variance_between(tau: Array, span: Array) -> Array:
     return between + np.stack([far**3 / 3.0, far * beyond / 2.0, far])
 
 
-def _hermite(tau: Array, span: Array) -> Array:
+def _hermite(place: Place) -> Array:
     """Return weights (3, 3, M) of what changes from node to node, of its rates at end and start.
 
     Of its value, of its rate, and of the derivative of that. Beyond the nodes the rate stays.
     """
+    tau, span = place.tau, place.span
     inside = np.clip(tau, 0.0, span)
     beyond = tau - inside
     tau, s, r = inside, inside / span, 1.0 - inside / span

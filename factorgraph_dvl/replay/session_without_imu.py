@@ -294,12 +294,12 @@ class ReplayWithoutImu:
         chain = WindowChain(
             frame=whole.frame,
             node_time=time,
+            attitude_time=time + whole.attitude_shift,
             density=np.concatenate([density, density[-1:]]),
             start=states,
             nRt=track_axes(record, whole.frame, states, time - nodes_late(whole, values), late),
             clock=whole.clock,
             attitude_clock=whole.attitude_clock,
-            first_shift=whole.first_shift,
             resolution=whole.resolution,
             known=past.known,
         )
@@ -451,7 +451,7 @@ def _going_on_straight(
     """
     known = len(states.p_n)
     since = (time[known:] - time[known - 1])[:, None]
-    stamp = np.clip(time[known - 1 :] + chain.first_shift, record.time[0], record.time[-1])
+    stamp = np.clip(time[known - 1 :] + chain.attitude_shift, record.time[0], record.time[-1])
     p_n = states.p_n[-1] + since * states.v_n[-1]
     level = level_axes(chain.frame, p_n)
     body = record.at(stamp[1:], np.zeros_like(p_n), level)

@@ -13,14 +13,13 @@ from functools import cached_property
 
 import gtsam
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.bound_observation import processes_of
+from factorgraph_dvl.graph.bound_observation import BoundObservation, processes_of
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
@@ -196,9 +195,10 @@ class Known:
     keys, sizes : list of int
         Keys of the variables of the node, of processes and of constants, and their
         dimensions.
-    root : ndarray, shape (n, n)
-        Square root R of their information, upper triangular: R (x - x0) = d + unit noise.
-    right : ndarray, shape (n,)
+    root : ndarray, shape (m, n)
+        Square root R of their information: R (x - x0) = d + unit noise. There may be less than n
+        rows: of nodes after the first one a part is known.
+    right : ndarray, shape (m,)
         Right-hand side d.
     values : gtsam.Values
         Where the rows are linear, x0.
@@ -212,9 +212,10 @@ class Known:
 
     def tilted(self, gradient: Array) -> Known:
         """Return it with a gradient (P,) of the cost by the constants, its last variables."""
-        right, own = self.right.copy(), slice(self.right.size - gradient.size, None)
-        right[own] -= solve_triangular(self.root[own, own], gradient, trans="T")
-        return replace(self, right=right)
+        of_all = np.append(np.zeros(self.root.shape[1] - gradient.size), gradient)
+        # Constants have priors, so that what is known has rows for every gradient by them.
+        moved = np.linalg.lstsq(self.root.T, of_all, rcond=None)[0]
+        return replace(self, right=self.right - moved)
 
     def factor(self) -> gtsam.LinearContainerFactor:
         """Return it as a factor."""
@@ -349,7 +350,7 @@ class Window:
 
     @cached_property
     def states(self) -> Array:
-        """Covariances (K, 9, 9) of the states of nodes where the true times are exact."""
+        """Covariances (K, 3, 3, 3) of the states in n where the true times are exact."""
         return covariances_at_true_times(self.problem, self.evaluation, self._posterior)
 
     @cached_property
@@ -398,17 +399,20 @@ class Window:
         kept, matrix, vector = _depended_on(rest, every, at.values.dims())
         triangle = np.asarray(np.linalg.qr(np.column_stack([matrix, vector]), mode="r"))
         n = matrix.shape[1]
-        renamed = {keys.node(first): keys.node(0), keys.rate(first): keys.rate(0)}
+        chain, count = problem.chain, problem.chain.node_time.size
+        staying, then = (
+            chain.keys_of(each) for each in (range(first, count), range(count - first))
+        )
+        renamed = dict(zip(staying, then, strict=True))
         for p in problem.processes:
             first_left = starts[p.name]
             renamed |= {p.key(j): p.key(j - first_left) for j in range(first_left, p.time.size)}
         sizes, values = at.values.dims(), gtsam.Values()
         rotations = {problem.key(p.name) for p in problem.parameters if p.rotation}
+        rotations.update(keys.attitude(k) for k in range(first, count))
         for key in kept:
-            if key == keys.node(first):
-                values.insert(keys.node(0), nav_state=at.values.atNavState(key))
-            elif key in rotations:
-                values.insert(key, at.values.atRot3(key))
+            if key in rotations:
+                values.insert(renamed.get(key, key), at.values.atRot3(key))
             else:
                 values.insert(renamed.get(key, key), at.values.atVector(key))
         known = Known(
@@ -430,14 +434,18 @@ class Window:
         time = [self.chain.node_time[first:]]
         for bound in self.problem.bound:
             if process in self.problem.processes_of(bound).all:
-                time.append(bound.observation.time[bound.attachment.node >= first])
+                time.append(bound.observation.time[~self._leaving(bound, first)])
         return int(process.place(np.concatenate(time))[0].min())
+
+    def _leaving(self, bound: BoundObservation, first: int) -> BoolArray:
+        """Whether measurements (M,) depend on nodes before one."""
+        return np.asarray(self.chain.nodes_at(bound.attachment).min(axis=1) < first)
 
     def _measured_before(self, first: int) -> dict[str, float]:
         """Return the time of the last measurement before a node, by label."""
         out = {}
         for bound in self.problem.bound:
-            time = bound.observation.time[bound.attachment.node < first]
+            time = bound.observation.time[self._leaving(bound, first)]
             if time.size:
                 out[bound.observation.label] = float(time[-1])
         return out

@@ -105,7 +105,7 @@ def with_covariances(
             origin = at_prior_along(problem, origin, fixed)
         problem.fix_directions(fixed, origin)
         minimum = minimise_again(problem.values(evaluation.states, origin))
-        covariances = considered(posterior(problem, minimum), changes)
+        covariances = considered(problem.chain, posterior(problem, minimum), changes)
         spurious = None
     return SolvedProblem(problem, minimum, covariances, fixed, findings, spurious)
 

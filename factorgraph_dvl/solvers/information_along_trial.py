@@ -278,7 +278,7 @@ class _Factor:
 def _rows_by_step(
     problem: Problem, evaluation: Evaluation, *, with_priors: bool
 ) -> dict[int, list[_Factor]]:
-    """Return all factors of the linearised graph by the first node of each.
+    """Return all factors of the linearised graph by the node before the last of each.
 
     What involves nothing but constants and the first node without a measurement, the priors, is
     under -1; noise that is correlated belongs to the node before its own, or before the first
@@ -304,7 +304,8 @@ def _rows_by_step(
         is_prior = i < priors and known <= {0}
         if is_prior and not with_priors:
             continue
-        k = -1 if is_prior else min(known, default=0)
+        # Attitudes may be those of other nodes: what is known of all of them comes before.
+        k = -1 if is_prior else max(min(known, default=0), max(known, default=0) - 1)
         if of_errors.keys() >= set(involved):
             others.append((k, _Factor(involved, factor)))
             continue

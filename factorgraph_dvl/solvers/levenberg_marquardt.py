@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -40,6 +41,9 @@ _MAX_DAMPING = 1e12
 # whole step sees.
 _PROBES = (0.1, 1.0)
 _LARGEST_BEND = 0.375
+# Earlier steps that show the curvature along them. Chosen: two clocks and a lever arm make up for
+# each other.
+_MEMORY = 3
 # Relative error of a cost that sums up 1e5 squares. Chosen: above that of double precision.
 _ROUNDING = 1e-12
 
@@ -140,7 +144,9 @@ def minimise(
     # Greatest damping with which a step failed since the cost last fell.
     failed = -1.0
     careful = False
-    promised = np.inf
+    promised = before = np.inf
+    # Where the last steps began, and what these were by the linear model there.
+    past: list[tuple[gtsam.Values, gtsam.VectorValues]] = []
     iteration = 0
     if progress:
         progress(stage, 0, evaluation.cost)
@@ -157,13 +163,19 @@ def minimise(
             delta = root.solution()
             promised = _promised(problem, evaluation, gaussian, delta)
         assert delta is not None
+        past = [*past[-_MEMORY:], (evaluation.values, delta)] if damping == 0.0 else []
         trial = problem.evaluate(evaluation.values.retract(delta))
+        slowly = promised > max(tolerance, _NEARLY, _POOR_GAIN * before)
+        if slowly and len(past) > 1 and problem.parameters:
+            trial = min(trial, _extrapolated(problem, past), key=lambda each: each.cost)
+        before = promised
         if (
             promised > max(tolerance, _NEARLY)
             and evaluation.cost - trial.cost < _POOR_GAIN * promised
         ):
             trial = _shorter(problem, evaluation, delta, promised, trial)
-        if promised > _WITHIN and evaluation.cost - trial.cost < _POOR_GAIN * promised:
+        slow = evaluation.cost - trial.cost < _POOR_GAIN * promised
+        if promised > _WITHIN and slow and damping == 0.0:
             bent = _bent(problem, evaluation, delta, ordering)
             trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
             gaussian = problem.linearize(evaluation)
@@ -218,6 +230,38 @@ def _promised(
     """Return by how much the linear model says that the cost falls."""
     beside = 0.0 if problem.tilt is None else problem.tilt.constant
     return float(evaluation.cost + beside - gaussian.error(delta))
+
+
+def _extrapolated(
+    problem: Problem, past: Sequence[tuple[gtsam.Values, gtsam.VectorValues]]
+) -> Evaluation:
+    """Return where the last steps of the linear model would end if they went on as they changed.
+
+    Gauss-Newton leaves out what residuals times second derivatives add to the curvature. Where
+    noise moves clocks that is much: steps go to and fro, or are short and many. How steps changed
+    by what was taken before shows that curvature along these (Anderson, Iterative procedures for
+    nonlinear integral equations, J. ACM 12(4), 1965; Walker and Ni, Anderson acceleration for
+    fixed-point iterations, SIAM J. Numerical Analysis 49(4), 2011). States follow the constants,
+    which decide by how much of each.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is minimised.
+    past : sequence of tuple of gtsam.Values and gtsam.VectorValues
+        Where two steps or more began, and the steps of the linear model there, the last one last.
+    """
+    keys = [problem.key(p.name) for p in problem.parameters]
+    (values, step), count = past[-1], len(past) - 1
+    taken = [past[i][0].localCoordinates(past[i + 1][0]) for i in range(count)]
+    changes = [past[i + 1][1].subtract(past[i][1]) for i in range(count)]
+    of_constants = np.column_stack([each.vector(keys) for each in (*changes, step)])
+    scale = np.linalg.norm(of_constants, axis=1)
+    of_constants /= np.where(scale > 0.0, scale, 1.0)[:, None]
+    shares = np.linalg.lstsq(of_constants[:, :-1], of_constants[:, -1], rcond=None)[0]
+    for share, move, change in zip(shares.tolist(), taken, changes, strict=True):
+        step = step.subtract(move.add(change).scale(share))
+    return problem.evaluate(values.retract(step))
 
 
 def _shorter(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -28,7 +30,8 @@ class Posterior:
     information : SquareRootInformation
         Information on all variables, the fixed directions taken as exact.
     nodes : ndarray, shape (K, 9, 9)
-        Covariances of the states, in GTSAM's tangent space, K Kᵀ included.
+        Covariances of the states in their tangent space, K Kᵀ included. Where a state has several
+        variables, without what is between these.
     given : ndarray, shape (K, 9, 9)
         Covariances of the states that are left where the parameters are exact.
     parameters : ndarray, shape (P, P)
@@ -50,15 +53,15 @@ class Posterior:
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
     """Return the covariances at a minimum that was proven, fixed directions taken as exact."""
     information = minimum.information
-    wanted = [keys.node(k) for k in range(problem.chain.node_time.size)]
-    marginals = information.marginals(wanted)
-    nodes = np.stack([marginals[key] for key in wanted])
+    wanted = [problem.chain.state_keys(k) for k in range(problem.chain.node_time.size)]
+    marginals = information.marginals([key for own in wanted for key in own])
+    nodes = np.stack([block_diag(*(marginals[key] for key in own)) for own in wanted])
     if not problem.parameters:
         return Posterior(information, nodes, nodes, np.zeros((0, 0)), {}, {})
     whiten = np.asarray(np.linalg.inv(problem.prior_root), float)
     every = {problem.key(name): whiten[:, place] for name, place in problem.columns.items()}
     with_every = information.covariance_with([every])
-    cross = np.stack([with_every[key] for key in wanted])
+    cross = of_states(problem.chain, with_every)
     P = information.covariance_of([every])
     given = nodes - cross @ np.linalg.solve(P, cross.transpose(0, 2, 1))
     others = {key: out for key, out in with_every.items() if key not in every}
@@ -82,10 +85,15 @@ def changes_with(found: Posterior, directions: Array, coupled: Array) -> dict[in
     return {key: out @ own for key, out in found.with_parameters.items()}
 
 
-def considered(found: Posterior, changes: dict[int, Array]) -> Posterior:
+def of_states(chain: Chain, by_key: Mapping[int, Array]) -> Array:
+    """Return rows (K, n, m) of the states of all nodes from those of their variables."""
+    every = range(chain.node_time.size)
+    return np.stack([np.concatenate([by_key[key] for key in chain.state_keys(k)]) for k in every])
+
+
+def considered(chain: Chain, found: Posterior, changes: dict[int, Array]) -> Posterior:
     """Return covariances where directions are fixed, with what depends on them."""
-    nodes = range(found.nodes.shape[0])
-    change = np.stack([changes[keys.node(k)] for k in nodes])
+    change = of_states(chain, changes)
     return replace(
         found, nodes=found.nodes + change @ change.transpose(0, 2, 1), considered=changes
     )

@@ -180,7 +180,8 @@ def _without_imu(trial: Trial, true_states: TrueStates) -> _Planned:
     chain, values = prepared.first_chain, _true_values(trial, prepared.parameters)
     every = {p.name: prior_mean(p) for p in prepared.parameters} | values
     time = chain.node_time - (0.0 if chain.clock is None else every[chain.clock])
-    states, turned = (true_states(chain.frame, t) for t in (time, time - chain.shift(every)))
+    at_turns = chain.attitude_time - every[chain.attitude_clock]
+    states, turned = (true_states(chain.frame, t) for t in (time, at_turns))
     states = replace(states, nRb=turned.nRb, omega_b=turned.omega_b)
     return _Planned(
         as_moving(chain, states, prepared.phase),

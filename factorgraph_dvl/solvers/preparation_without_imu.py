@@ -55,10 +55,9 @@ _MOST_NODES = 60_000
 _GROUND_SPAN, _WATER_SPAN = 5.0, 15.0
 # Density of acceleration, m²/s³, where the log does not show one.
 _DENSITY = 1e-3
-# Share of the time between nodes by which their attitudes are earlier. Chosen: where a ping is at
-# a node of both, the acceleration jumps, and clocks stay there; with a half, fixes are carried far
-# beyond the nodes of the attitude.
-_EARLY = 0.25
+# Share of the time between nodes by which their attitudes are earlier. Where a ping is at a node
+# of attitudes, their acceleration jumps, and clocks may stay there: half-way is farthest.
+_EARLY = 0.5
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
 LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
@@ -208,16 +207,16 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     chain = SmoothChain(
         frame=frame,
         node_time=nodes,
+        attitude_time=nodes + late - lag - early,
         density=_densities(trial, record, values, states, nodes, phase, late),
         start=states,
         nRt=track_axes(record, frame, states, nodes - lag, late),
         clock=clock if any(p.name == clock and p.estimated for p in parameters) else None,
         attitude_clock=record.sensor.clock.offset.name,
-        first_shift=late - lag - early,
         resolution=record.interval,
     )
     if chain.clock is None:
-        chain = replace(chain, node_time=nodes - lag, first_shift=late - early)
+        chain = replace(chain, node_time=nodes - lag)
     by_aid = [
         (aid, lasting_observations(aid, frame, trial.body_axes, trial)) for aid in trial.aids
     ]
@@ -295,10 +294,10 @@ def _anew(
 
     Clocks have moved pings between nodes of the attitude; at a node they would stay.
     """
-    moved = chain.shift(values) - _early(chain.node_time)
-    motion = chain.motion(chain.attach(chain.node_time, moved, turning=True), states)
+    shift = chain.shift(values) - _early(chain.node_time)
+    motion = chain.motion(chain.attach(chain.node_time, shift), states)
     own = SmoothStates(motion.nRb, states.p_n, states.v_n, motion.omega_eb_b)
-    return replace(chain, first_shift=chain.first_shift + moved), own
+    return replace(chain, attitude_time=chain.node_time + shift), own
 
 
 def _early(nodes: Array) -> float:

@@ -74,7 +74,7 @@ class StateRanges:
             problem, at = self.part(block)
             nodes = self.chain.nodes_of(block) if block else None
             trees = [tree for tree, _ in _eliminations(problem, at, nodes, left)]
-            following = known | SquareRootInformation(trees, at.values.dims()).following(known)
+            own = SquareRootInformation(trees, at.values.dims()).following(known)
             # Priors of what all states share belong to the first range.
             yield (
                 (
@@ -84,10 +84,10 @@ class StateRanges:
                         block and block.start and shared.keys() >= set(each[0].keys[0].tolist())
                     )
                 ),
-                following,
+                known | own,
             )
-            first = self.chain.keys_of([nodes[0]] if nodes else [])
-            known = dict(shared) | {key: following[key] for key in first}
+            # The range before depends on the first of these nodes.
+            known = dict(shared) | own
 
 
 def eliminated_by_ranges(part: Part, chain: Chain, *, whole: bool = False) -> StateRanges:

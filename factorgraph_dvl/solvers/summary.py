@@ -10,8 +10,10 @@ import numpy as np
 from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -99,9 +101,10 @@ def trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Tra
     chain = found.problem.chain
     if isinstance(chain, PlanarChain):
         return planar_trajectory(found, chain, rate_hz)
-    if chain.interpolates:
+    if isinstance(chain, SmoothChain):
         at = found.minimum.evaluation
         return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)
+    assert isinstance(chain, InertialChain)
     states = found.minimum.evaluation.states
     return chain.trajectory(states, found.covariances.nodes, body_axes, rate_hz)
 

@@ -9,12 +9,11 @@ import numpy as np
 from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, rotate
-from factorgraph_dvl.graph import keys
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
-from factorgraph_dvl.graph.trajectory import between, epochs_between, reported, tangent_in_n
-from factorgraph_dvl.solvers.posterior import Posterior
+from factorgraph_dvl.graph.trajectory import between, epochs_between, reported
+from factorgraph_dvl.solvers.posterior import Posterior, of_states
 
 # Epochs whose covariances are computed at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -25,25 +24,28 @@ _ATTITUDE, _OTHERS = slice(0, 3), slice(3, 9)
 def covariances_at_true_times(
     problem: Problem, evaluation: Evaluation, covariances: Posterior
 ) -> Array:
-    """Return the covariances (K, 9, 9) of the states of nodes where the true times are exact.
+    """Return the covariances of the states of nodes where the true times are exact, (K, 3, 3, 3).
 
-    At a true time is what the nodes have later by the offset of their clock: there the motion errs
-    by what it changes in the error of the offset too.
+    Of attitude, position and velocity in n. At a true time is what the nodes have later by the
+    offset of their clock: there the motion errs by what it changes in the error of the offset too.
     """
     chain, states = problem.chain, evaluation.states
     acceleration = np.gradient(states.v_n, chain.node_time, axis=0)
-    bRn = states.nRb.transpose(0, 2, 1)
-    moved = np.hstack([states.omega_b, rotate(bRn, states.v_n), rotate(bRn, acceleration)])
-    every = range(chain.node_time.size)
-    with_parameters = np.stack([covariances.with_parameters[keys.node(k)] for k in every])
+    moved = np.hstack([states.omega_b, states.v_n, acceleration])
+    with_parameters = of_states(chain, covariances.with_parameters)
     by_clocks = np.zeros((chain.node_time.size, 9, len(problem.prior_root)))
-    for clock, rows in ((chain.attitude_clock or chain.clock, _ATTITUDE), (chain.clock, _OTHERS)):
+    for clock, rows in ((chain.attitude_clock, _ATTITUDE), (chain.clock, _OTHERS)):
         if clock in problem.columns:
             own = problem.prior_root[problem.columns[clock]][0]
             by_clocks[:, rows] = moved[:, rows, None] * own
     cross = with_parameters @ by_clocks.transpose(0, 2, 1)
     P = covariances.nodes + cross + cross.transpose(0, 2, 1)
-    return P + by_clocks @ covariances.parameters @ by_clocks.transpose(0, 2, 1)
+    P += by_clocks @ covariances.parameters @ by_clocks.transpose(0, 2, 1)
+    own = (slice(i, i + 3) for i in range(0, 9, 3))
+    out = np.stack([P[:, rows, rows] for rows in own], axis=1)
+    # Attitudes turn in axes of the body.
+    out[:, 0] = states.nRb @ out[:, 0] @ states.nRb.transpose(0, 2, 1)
+    return out
 
 
 def known_span(chain: SmoothChain, values: Mapping[str, Array]) -> tuple[float, float]:
@@ -51,9 +53,9 @@ def known_span(chain: SmoothChain, values: Mapping[str, Array]) -> tuple[float, 
 
     Positions are known up to the last node but one, attitudes up to the last.
     """
-    node_time, shift = chain.node_time, chain.shift(values)
-    first = float(node_time[0]) - min(shift, 0.0)
-    last = min(float(node_time[-2]), float(node_time[-1]) - shift)
+    turned = chain.attitude_time[[0, -1]] - chain.shift(values)
+    first = max(float(chain.node_time[0]), float(turned[0]))
+    last = min(float(chain.node_time[-2]), float(turned[1]))
     lag = nodes_late(chain, values)
     return first - lag, last - lag
 
@@ -101,10 +103,9 @@ def epochs_at_most(chain: SmoothChain, first: float, last: float, rate_hz: float
 def motion_at_true_times(
     chain: SmoothChain, evaluation: Evaluation, P: Array, body_axes: BodyAxes, time: Array
 ) -> Trajectory:
-    """Return the motion at times (M,), s, by `covariances_at_true_times` P (K, 9, 9)."""
-    values, states, node_time = evaluation.parameters, evaluation.states, chain.node_time
+    """Return the motion at times (M,), s, by `covariances_at_true_times` P (K, 3, 3, 3)."""
+    values, states = evaluation.parameters, evaluation.states
     lag, shift = nodes_late(chain, values), chain.shift(values)
-    P_n = tangent_in_n(P, states.nRb)
     parts = []
     for i in range(0, max(time.size, 1), _CHUNK):
         some = time[i : i + _CHUNK]
@@ -112,18 +113,11 @@ def motion_at_true_times(
         motion = chain.transition(at, states)
         covariance = np.concatenate(
             [
-                between(P_n[:, :1], *_place(node_time, at.turned)),
-                between(P_n[:, 1:], *_place(node_time, at.time)),
+                between(part, place.node, np.clip(place.tau / place.span, 0.0, 1.0))
+                for part, place in ((P[:, :1], at.turned), (P[:, 1:], at.place))
             ],
             axis=1,
         )
         covariance += motion.missing(chain.density, chain.nRt)
         parts.append(reported(some, motion.motion, covariance, chain.frame, body_axes))
     return parts[0] if len(parts) == 1 else concatenated(parts)
-
-
-def _place(node_time: Array, time: Array) -> tuple[np.ndarray, Array]:
-    """Return the nodes before times (M,), and how far the times are on the way to the next."""
-    node = np.clip(np.searchsorted(node_time, time, side="right") - 1, 0, node_time.size - 2)
-    fraction = (time - node_time[node]) / (node_time[node + 1] - node_time[node])
-    return node, np.clip(fraction, 0.0, 1.0)

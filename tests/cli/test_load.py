@@ -145,7 +145,7 @@ def content(path):
 
 def untimed(line):
     """Return a printed line without times that the run took; nothing if it is about progress."""
-    if line.startswith('{"event":"progress"'):
+    if line.startswith('{"event":"progress"') or re.match(r" *\d+\.\d s: ", line):
         return ""
     return re.sub(r"latency.*longest \S+", "", line)
 

@@ -45,7 +45,7 @@ def stacked(evaluation, members):
 
 
 def keyed(problem, names, k):
-    around = problem.chain.variables(np.array([k]))
+    around = problem.chain.variables(np.array([[k]]))
     return [*(int(key[0]) for key in around), *(problem.key(n) for n in names)]
 
 

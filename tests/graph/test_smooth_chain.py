@@ -74,7 +74,12 @@ def test_the_gradient_is_that_of_the_cost(problem, values):
     problem.weigh(problem.evaluate(values))
     here = problem.evaluate(values)
     gradient = problem.linearize(here).gradientAtZero()
-    some = [keys.node(7), keys.rate(7), *(problem.key(p.name) for p in problem.parameters)]
+    some = [
+        keys.attitude(7),
+        keys.rate(7),
+        keys.node(7),
+        *(problem.key(p.name) for p in problem.parameters),
+    ]
     some += [process.key(1) for process in problem.processes]
     level = by_level_axes(problem, here, here)
     for key in some:
@@ -115,54 +120,48 @@ def test_the_clock_of_attitudes_leaves_these_where_they_are(prepared, problem):
             assert changed.max() > 1e-4
 
 
-def test_a_clock_that_moves_fixes_past_nodes_makes_no_jump(prepared):
-    """Value and slope of the cost go on where fixes pass their nodes by little."""
+@pytest.mark.parametrize("moved", ["m", "rad"])
+def test_a_clock_that_moves_measurements_past_nodes_makes_no_jump(prepared, moved):
+    """The cost goes on where fixes pass nodes, and where pings pass those of attitudes."""
     chain, start = prepared.first_chain, prepared.values
+    clock = {"m": chain.clock, "rad": chain.attitude_clock}[moved]
     rng = np.random.default_rng(2)
     states = prepared.states.retracted(rng.normal(0.0, 1e-3, (prepared.states.p_n.shape[0], 12)))
+    problem = Problem(chain, prepared.observations, prepared.parameters, start=start)
 
-    def bound_at(late):
-        values = start | {chain.clock: start[chain.clock] + late}
-        problem = Problem(chain, prepared.observations, prepared.parameters, start=values)
-        for bound in problem.bound:
-            bound.attach(problem.prior_values() | values)
-        return problem
+    def at(late):
+        values = problem.prior_values() | start | {clock: start[clock] + late}
+        return problem.evaluate(problem.values(states, values))
 
-    (fixes,) = (b for b in bound_at(0.0).bound if b.observation.unit == "m")
-    node_time = chain.node_time
-    to_node = node_time[fixes.attachment.node + 1] - fixes.attachment.time
-    # From here on, some fixes pass a node.
+    problem.weigh(at(0.0))
+    # Fixes move beside the nodes, and pings beside those of the attitude.
+    unit = {"m": "m", "rad": "m/s"}[moved]
+    (which,) = (i for i, b in enumerate(problem.bound) if b.observation.unit == unit)
+    used = (problem.weights[which] > 0.0).any(axis=1)
+    here = at(0.0).attached[which]
+    place = here.place if moved == "m" else here.turned
+    to_node = (place.span - place.tau)[used]
+    # From here on, some pass a node.
     edge = float(to_node[to_node > 1e-3].min())
-    before, after = bound_at(edge - 1e-3), bound_at(edge + 1e-3)
-    steps = edge + 1e-3 * np.array([-0.5, -0.25, 0.25, 0.5])
-
-    def costs(problem):
-        found = []
-        for late in steps:
-            values = problem.prior_values() | start | {chain.clock: start[chain.clock] + late}
-            evaluation = problem.evaluate(problem.values(states, values))
-            found.append(evaluation.cost)
-        return np.array(found)
-
-    evaluation = before.evaluate(before.values(states, before.prior_values() | start))
-    before.weigh(evaluation)
-    after.weigh(evaluation)
-    for problem in (before, after):
-        cost = costs(problem)
-        slopes = np.diff(cost) / np.diff(steps)
-        # A straight line through four points, but for what bends it over a millisecond.
-        bend = cost[1:3].sum() - cost[[0, 3]].sum()
-        assert abs(bend) < 1e-6 * cost[0]
-        np.testing.assert_allclose(slopes, slopes[1], rtol=0.05)
-    # There is a jump between the two: by whose nodes the fixes go on.
-    assert np.abs(costs(before) - costs(after)).min() > 1e-6 * costs(before)[0]
+    nodes = [chain.nodes_at(at(edge + by).attached[which])[used] for by in (-1e-4, 1e-4)]
+    assert (nodes[0] != nodes[1]).any()
+    h = 1e-4
+    before, after = (np.array([at(edge + by).cost for by in (s, 2.0 * s)]) for s in (-h, h))
+    # Carried on from either side, both lead to the same value with the same slope.
+    slope = (before[0] - before[1]) / h, (after[1] - after[0]) / h
+    middle = 2.0 * before[0] - before[1], 2.0 * after[0] - after[1]
+    assert middle[0] == pytest.approx(middle[1], rel=1e-9)
+    if moved == "m":
+        # Velocities and rates have a slope that jumps at nodes: acceleration is no state.
+        assert slope[0] == pytest.approx(slope[1], rel=1e-3)
 
 
 def test_what_is_missing_half_way_by_hand(prepared):
     chain, k = prepared.first_chain, 5
     start, dt = chain.node_time[k], chain.node_time[k + 1] - chain.node_time[k]
     q, axis, zero = chain.density[k], np.array([0.0, 1.0, 0.0]), np.zeros((1, 1))
-    at = chain.attach(np.array([start + 0.5 * dt]))
+    # By the clock of attitudes, as far from its nodes.
+    at = chain.attach(np.array([start + 0.5 * dt]), chain.attitude_shift)
     along = {"d_p": chain.nRt[k] @ axis, "d_v": chain.nRt[k] @ axis, "d_theta": axis}
     along = {name: each[None, None] for name, each in (along | {"d_omega": axis}).items()}
 
@@ -180,12 +179,11 @@ def test_what_is_missing_half_way_by_hand(prepared):
     # Half-way both are independent; at a third, tau² rest² (rest - tau) / 2 dt³ = 2/243 dt².
     every = missing("d_p", "d_v", "d_theta", "d_omega")
     assert every == pytest.approx((q[1] + q[4]) * (dt / 16.0 + dt**3 / 192.0))
-    third = chain.attach(np.array([start + dt / 3.0]))
+    third = chain.attach(np.array([start + dt / 3.0]), chain.attitude_shift)
     both, alone = missing("d_p", "d_v", at=third), (missing(n, at=third) for n in ("d_p", "d_v"))
     assert both - sum(alone) == pytest.approx(2.0 * q[4] * 2.0 / 243.0 * dt**2)
     # Attitudes have their own place between the nodes, and beyond these only one node is known.
-    late = chain.attach(at.time, shift=0.5 * dt + 2.0)
-    late = replace(late, node=at.node)
+    late = replace(at, turned=replace(at.turned, tau=at.turned.span + 2.0))
     assert missing("d_v", at=late) == pytest.approx(q[4] * dt / 16.0)
     assert missing("d_omega", at=late) == pytest.approx(2.0 * q[1])
     both = missing("d_theta", "d_omega", at=late)
@@ -211,7 +209,7 @@ def test_pings_at_nodes_miss_nothing_where_clocks_agree(prepared, problem):
         return ping.missing(at, motion, evaluation.parameters, problem.processes_of(ping))
 
     # Attitudes of nodes are early by this.
-    agreed = -problem.chain.shift(start)
+    agreed = problem.chain.attitude_shift - problem.chain.shift(start)
     np.testing.assert_allclose(missing(agreed)[at_nodes], 0.0, atol=1e-12)
     assert (missing(agreed)[~at_nodes & ping.usable] > 1e-6).all()
     # Rates, which count by the lever arm, and attitudes, by the speed, then are between nodes.
@@ -261,9 +259,9 @@ def test_gtsams_own_optimiser_and_marginals_agree(prepared, problem):
     # Clocks have moved since: measurements are bound anew, with pings between nodes of the
     # attitude, where its acceleration does not jump.
     chain = problem.chain
-    early = problem.chain.first_shift + chain.shift(near.parameters) - 0.2
+    early = chain.shift(near.parameters) - 0.2
     problem = Problem(
-        replace(chain, first_shift=early),
+        replace(chain, attitude_time=chain.node_time + early),
         problem.observations,
         problem.all_parameters,
         start=near.parameters,

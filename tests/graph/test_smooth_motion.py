@@ -7,10 +7,12 @@ from dataclasses import fields, replace
 import gtsam
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.graph.smooth_motion import (
+    Place,
     SmoothStates,
     interpolated,
     motion_steps,
@@ -26,6 +28,8 @@ NODE = np.array([0, 0, 1, 2, 3, 4, 4, 0, 2, 3])
 AT = np.array([0.0, 0.2, 1.1, 3.9, 4.6, 6.1, 6.5, -0.3, 1.8, 5.2])
 # What the clock of attitudes is late by: either may be beyond nodes by itself.
 TURNED = AT + np.array([0.0, 0.1, -0.05, 0.3, 0.45, -0.2, 0.1, 0.2, 0.3, -0.1])
+# Nodes of attitudes: the same, or others.
+TURNED_NODE = np.array([0, 0, 0, 2, 4, 4, 4, 0, 2, 4])
 DENSITY = np.array([1e-3, 2e-3, 5e-4, 0.02, 0.01, 0.03])
 VARYING = DENSITY * np.linspace(1.0, 3.0, SPANS.size)[:, None]
 # Standard deviations of the turn from node to node, rad.
@@ -70,8 +74,14 @@ def steps_of(states, nRt, time=TIME, density=VARYING):
     return motion_steps(turns_of(time, states), states, nRt, density)
 
 
-def motion_at(states, node=NODE, at=AT, turned=TURNED):
-    return interpolated(turns_of(TIME, states), TIME, states, node, at, turned)
+def places(node, time, nodes=TIME):
+    return Place(node, time - nodes[node], np.diff(nodes)[node])
+
+
+def motion_at(states, node=NODE, at=AT, turned=TURNED, turned_node=TURNED_NODE):
+    return interpolated(
+        turns_of(TIME, states), states, places(node, at), places(turned_node, turned)
+    )
 
 
 def difference(motion, from_motion):
@@ -83,7 +93,10 @@ def difference(motion, from_motion):
 
 
 def numerical(function, states):
-    """Return derivatives (K, 12, ...) of function(states) by the tangent of every node."""
+    """Return derivatives (K, 12, ...) of function(states) by the tangent of every node.
+
+    Turn and rate, then position and velocity.
+    """
     h = 1e-6
     out = []
     for k in range(TIME.size):
@@ -141,7 +154,8 @@ def test_half_way_by_hand():
     states = SmoothStates(exp_so3(0.8 * one), 8.0 * one, 3.0 * one, 0.3 * one)
     time, half = np.array([0.0, 2.0]), np.ones(1)
     turns = turns_of(time, states)
-    found = interpolated(turns, time, states, np.zeros(1, dtype=int), half, half).motion
+    middle = places(np.zeros(1, dtype=int), half, time)
+    found = interpolated(turns, states, middle, middle).motion
     # Half the way less T/8 of the rate; 3/2 of the mean rate less a quarter of that at the end.
     assert found.p_n[0, 2] == pytest.approx(4.0 - 0.75)
     assert found.v_n[0, 2] == pytest.approx(6.0 - 0.75)
@@ -168,8 +182,10 @@ def test_jacobians_between_nodes(size):
     between, lin = motion_at(states), identity_rows(AT.size)
     found = between.by_nodes(lin)
     expected = numerical(lambda s: difference(motion_at(s).motion, between.motion), states)
-    for m, k in enumerate(NODE):
-        both = np.concatenate([expected[k, :, m].T, expected[k + 1, :, m].T], axis=1)
+    for m, (k, j) in enumerate(zip(TURNED_NODE, NODE, strict=True)):
+        around = (expected[k, :6, m], expected[k + 1, :6, m])
+        around += (expected[j, 6:, m], expected[j + 1, 6:, m])
+        both = np.concatenate([each.T for each in around], axis=1)
         for row in range(0, 12, 3):
             some = slice(row, row + 3)
             atol = 1e-8 * max(1.0, np.abs(both[some]).max())
@@ -188,8 +204,11 @@ def test_the_frame_n_does_not_matter_and_transposed_axes_do():
     p_n, v_n = rotate(turn[None], states.p_n), rotate(turn[None], states.v_n)
     turned = SmoothStates(turn @ states.nRb, p_n, v_n, states.omega_b)
     first, second = steps_of(states, nRt), steps_of(turned, turn @ nRt)
-    for one, other in zip(first, second, strict=True):
-        np.testing.assert_allclose(other, one, atol=1e-9)
+    np.testing.assert_allclose(second.residual, first.residual, atol=1e-9)
+    # Positions and velocities are in n.
+    back = block_diag(np.eye(6), turn, turn)
+    for one, other in zip(first[1:], second[1:], strict=True):
+        np.testing.assert_allclose(other @ back, one, atol=1e-9)
     here, there = motion_at(states), motion_at(turned)
     np.testing.assert_allclose(there.motion.nRb, turn @ here.motion.nRb, atol=1e-12)
     for name in ("omega_eb_b", "alpha_b"):
@@ -213,8 +232,10 @@ def test_each_is_the_derivative_in_time_of_the_other(size):
     states, _ = scene(size)
     # At nodes accelerations jump.
     inside, h = ~np.isin(AT, TIME), 1e-5
-    node, at, turned = NODE[inside], AT[inside], TURNED[inside]
-    up, down, here = (motion_at(states, node, at + s, turned + s).motion for s in (h, -h, 0.0))
+    node, at, turned, other = (each[inside] for each in (NODE, AT, TURNED, TURNED_NODE))
+    up, down, here = (
+        motion_at(states, node, at + s, turned + s, other).motion for s in (h, -h, 0.0)
+    )
     slope = difference(up, down) / (2.0 * h)
     np.testing.assert_allclose(slope[:, :3], here.omega_eb_b, atol=1e-7)
     np.testing.assert_allclose(slope[:, 3:6], here.v_n, atol=1e-7)
@@ -230,12 +251,12 @@ def test_at_both_nodes_it_is_the_nodes_and_goes_on_from_there(size):
     for k in (before, before + 1):
         for late in (0.0, 1e-9, -1e-9):
             time = TIME[k] + late
-            found = motion_at(states, before, time, time).motion
+            found = motion_at(states, before, time, time, before).motion
             np.testing.assert_allclose(found.nRb, states.nRb[k], atol=1e-8)
             np.testing.assert_allclose(found.p_n, states.p_n[k], atol=1e-7)
             np.testing.assert_allclose(found.v_n, states.v_n[k], atol=1e-7)
             np.testing.assert_allclose(found.omega_eb_b, states.omega_b[k], atol=1e-7)
-    beyond = motion_at(states, before, TIME[1:] + 2.0, TIME[1:]).motion
+    beyond = motion_at(states, before, TIME[1:] + 2.0, TIME[1:], before).motion
     np.testing.assert_allclose(beyond.p_n, states.p_n[1:] + 2.0 * states.v_n[1:], atol=1e-11)
     np.testing.assert_allclose(beyond.v_n, states.v_n[1:], atol=1e-12)
     np.testing.assert_array_equal(beyond.a_n, 0.0)
@@ -271,7 +292,8 @@ def test_given_nodes_it_is_the_process_of_white_acceleration():
     p_n, v_n = np.random.default_rng(4).standard_normal((2, 3, 3))
     states = SmoothStates(np.tile(np.eye(3), (3, 1, 1)), p_n, v_n, np.zeros((3, 3)))
     mean = -np.linalg.solve(among, of_nodes @ np.stack([p_n, v_n], axis=1).reshape(6, 3))
-    found = interpolated(turns_of(time, states), time, states, node, at, at).motion
+    place = places(node, at, time)
+    found = interpolated(turns_of(time, states), states, place, place).motion
     np.testing.assert_allclose(found.p_n, mean[0::2], atol=1e-9)
     np.testing.assert_allclose(found.v_n, mean[1::2], atol=1e-9)
 
@@ -296,12 +318,14 @@ def test_what_is_missing_is_the_covariance_of_the_prior_given_the_nodes(turn, to
     P = np.linalg.inv(information[free][:, free]).reshape(4, 12, 4, 12)
     known = SmoothStates(*(getattr(states, f.name)[KNOWN] for f in fields(SmoothStates)))
     time, at, node = DENSE[KNOWN], DENSE[~KNOWN], np.array([0, 0, 1, 1])
-    between = interpolated(turns_of(time, known), time, known, node, at, at)
+    place = places(node, at, time)
+    between = interpolated(turns_of(time, known), known, place, place)
     found = between.missing(density[[1, 4]], nRt[KNOWN])
     for m, to_n in enumerate(nRb[~KNOWN]):
-        for i in range(3):
-            own = P[m, 3 * i : 3 * i + 3, m, 3 * i : 3 * i + 3]
-            expected = to_n @ own @ to_n.T
+        # Attitudes turn about axes of the body; positions and velocities are in n.
+        for i, (first, axes) in enumerate(((0, to_n), (6, np.eye(3)), (9, np.eye(3)))):
+            own = P[m, first : first + 3, m, first : first + 3]
+            expected = axes @ own @ axes.T
             atol = tolerance * np.abs(expected).max()
             np.testing.assert_allclose(found[m, i], expected, atol=atol)
 

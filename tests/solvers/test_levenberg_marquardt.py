@@ -46,6 +46,7 @@ class AtAKink:
     """Lowest cost at 0, where a linear model promises to lower it further."""
 
     tilt = None
+    parameters = ()
 
     def evaluate(self, values):
         return SimpleNamespace(
