@@ -16,14 +16,14 @@ solved, *_ = fd.solved_problems(trial)
 problem = solved.problem
 graph, start = problem.nonlinear_graph()
 
-# Letters of the keys: attitude, position and velocity `x`, turn rates `w`, then what is estimated.
+# Letters of the keys: attitude `r`, turn rates `w`, position and velocity `x`; others have names.
 names = {problem.key(p.name): p.name for p in problem.parameters}
 for process in problem.processes:
     names |= {process.key(j): process.name for j in range(process.time.size)}
 kinds: dict[tuple[str, ...], list[list[int]]] = {}
 for i in range(graph.size()):
     keys = graph.at(i).keys()
-    letters = {120: "state", 119: "turn rates"}
+    letters = {114: "attitude", 119: "turn rates", 120: "track"}
     kind = tuple(names.get(k) or letters[gtsam.symbolChr(k)] for k in keys)
     kinds.setdefault(kind, []).append(keys)
 for kind, every in kinds.items():

@@ -274,6 +274,12 @@ class Problem:
         """Inverse standard deviations of the observations, (M, d) each; 0 = not used."""
         return tuple(b.weight for b in self._bound)
 
+    @cached_property
+    def clock_keys(self) -> list[int]:
+        """Keys of the clocks that are estimated and move measurements along the chain."""
+        names = {name for bound in self._bound for name in bound.clocks}
+        return [key for name, key in self._key.items() if name in names]
+
     def prior_values(self) -> dict[str, Array]:
         """Return the prior means of all parameters, rotations as matrices."""
         return {p.name: prior_mean(p) for p in self.all_parameters}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -44,6 +44,11 @@ _LARGEST_BEND = 0.375
 # Earlier steps that show the curvature along them. Chosen: two clocks and a lever arm make up for
 # each other.
 _MEMORY = 3
+# Share of what a step promises that is hardly any, and share of the step along which a cost whose
+# slope jumps rises. Chosen: far below and above rounding.
+_HARDLY, _AT_ONCE = 0.01, 0.01
+# Standard deviation of a clock that stays where it is, s. Chosen: no clock is known as well.
+_STAYS = 1e-8
 # Relative error of a cost that sums up 1e5 squares. Chosen: above that of double precision.
 _ROUNDING = 1e-12
 
@@ -143,7 +148,7 @@ def minimise(
     damping = 0.0
     # Greatest damping with which a step failed since the cost last fell.
     failed = -1.0
-    careful = False
+    careful = held = False
     promised = before = np.inf
     # Where the last steps began, and what these were by the linear model there.
     past: list[tuple[gtsam.Values, gtsam.VectorValues]] = []
@@ -153,6 +158,8 @@ def minimise(
     while iteration < max_iterations:
         iteration += 1
         damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
+        if held:
+            damped = _held(damped, problem.clock_keys)
         last = proven and damping == 0.0 and promised < _NEAR
         delta = None if careful or last else quick_step(damped, ordering)
         promised = (
@@ -179,6 +186,10 @@ def minimise(
             bent = _bent(problem, evaluation, delta, ordering)
             trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
             gaussian = problem.linearize(evaluation)
+            fallen = evaluation.cost - trial.cost
+            if not held and fallen < _HARDLY * promised and _at_jump(problem, evaluation, delta):
+                held, past, root = True, [], None
+                continue
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
         small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
@@ -193,6 +204,9 @@ def minimise(
                 evaluation = trial
             if progress:
                 progress(stage, iteration, evaluation.cost)
+            if ended and damping == 0.0 and held:
+                gaussian = problem.linearize(evaluation)
+                break
             if ended and damping == 0.0 and (root is not None or not proven):
                 return Minimum(evaluation, root, True, iteration)
             if evaluation.cost < enough:
@@ -205,6 +219,9 @@ def minimise(
             if damping <= failed:
                 # Steps that small gain nothing, and larger ones fail: so it would go on.
                 break
+        elif promised < _WITHIN and damping == 0.0 and held:
+            ended = True
+            break
         elif promised < _WITHIN and damping == 0.0 and (root is not None or not proven):
             return Minimum(evaluation, root, True, iteration)
         elif not careful and root is None:
@@ -218,7 +235,7 @@ def minimise(
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
     promised = _promised(problem, evaluation, gaussian, root.solution())
-    return Minimum(evaluation, root, promised < _WITHIN, iteration)
+    return Minimum(evaluation, root, promised < _WITHIN or (held and ended), iteration)
 
 
 def _promised(
@@ -230,6 +247,31 @@ def _promised(
     """Return by how much the linear model says that the cost falls."""
     beside = 0.0 if problem.tilt is None else problem.tilt.constant
     return float(evaluation.cost + beside - gaussian.error(delta))
+
+
+def _at_jump(problem: Problem, evaluation: Evaluation, delta: gtsam.VectorValues) -> bool:
+    """Whether the cost rises at once along a step by which the linear model says that it falls.
+
+    Its slope then jumps, and there is a minimum at the jump. Without an IMU the acceleration jumps
+    at nodes, and so does the slope by clocks that move velocities past one.
+    """
+    if not problem.clock_keys:
+        return False
+    probe = problem.evaluate(evaluation.values.retract(delta.scale(_AT_ONCE)))
+    return probe.cost > evaluation.cost
+
+
+def _held(
+    gaussian: gtsam.GaussianFactorGraph, clocks: Collection[int]
+) -> gtsam.GaussianFactorGraph:
+    """Return the graph with clocks that stay where they are."""
+    out = gtsam.GaussianFactorGraph()
+    for i in range(gaussian.size()):
+        out.push_back(gaussian.at(i))
+    unit = gtsam.noiseModel.Unit.Create(1)
+    for key in clocks:
+        out.add(key, np.full((1, 1), 1.0 / _STAYS), np.zeros(1), unit)
+    return out
 
 
 def _extrapolated(

@@ -136,6 +136,10 @@ def motion_strengths(
     moved = np.concatenate(
         [step.at(problem.key(name)) for name in problem.columns] or [np.zeros(0)]
     )
+    before = problem.tilt
+    if before is not None and before.hold is None:
+        # At a minimum the step is this; where the slope jumps, the linear model has another.
+        moved = covariance @ before.gradient
     tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
     other = (np.abs(wanted) > _SAME) & (gain > least_gain)
     same = not other.any() and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS

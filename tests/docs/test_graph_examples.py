@@ -31,10 +31,10 @@ def test_the_graph_without_imu_is_printed_kind_by_kind(monkeypatch, capsys):
     for line in lines:
         count, keys, names = re.fullmatch(r" *(\d+) × ([^:]+): (.*)", line).groups()
         kinds[names] = int(count), keys.split()
-    nodes, steps = kinds["state"][0], kinds["state, turn rates"]
-    assert nodes == 1
+    assert [kinds[name][0] for name in ("attitude", "turn rates", "track")] == [1, 1, 1]
+    steps = kinds["attitude, turn rates, track"]
     assert steps[0] > 100
-    assert steps[1] == ["x0", "w0", "x1", "w1"]
+    assert steps[1] == ["r0", "w0", "r1", "w1", "x0", "x1"]
     measured = {names: count for names, (count, _) in kinds.items() if "time_offset_s" in names}
     assert sorted(measured.values())[-1] > 4 * sorted(measured.values())[0]
     assert sum("misalignment_deg" in names for names in measured) >= 1
