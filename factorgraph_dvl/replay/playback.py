@@ -22,6 +22,7 @@ from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Calibration, Progress, Solution
+from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.trial import Trial
 
 # What holds only until something else is said.
@@ -271,13 +272,10 @@ def _solution(
                 "IMU",
             )
         )
-    left_out = () if trial.imu is None or trial.dvl is None else trial.dvl.settings.left_out
-    if "scale_walk_std_sqrt_h" in left_out:
-        findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
-    if "averaging_s" in left_out:
-        findings.append(
-            Finding(Code.ERROR_LEFT_OUT, message("error_left_out.window", section="dvl"), "DVL")
-        )
+    if trial.imu is not None:
+        if trial.dvl is not None and "scale_walk_std_sqrt_h" in trial.dvl.settings.left_out:
+            findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
+        findings += windows_left_out(trial.aids)
     if run.unused >= LEAST:
         findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:

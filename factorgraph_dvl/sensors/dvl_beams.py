@@ -116,6 +116,11 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
     averaging_std_s: NonNegative | UnsetType = UNSET
     stamp: Stamp = "middle"
 
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The window, where there is one."""
+        return ("averaging_s",) if self.averaging_s > 0.0 else ()
+
     def __post_init__(self) -> None:
         super().__post_init__()
         ways = {

@@ -31,6 +31,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
@@ -563,17 +564,17 @@ def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval
 
 def _left_out(trial: Trial) -> list[Finding]:
     """Name errors that the trial states and that are not estimated without an IMU."""
-    return [
+    changes = [
         Finding(
             Code.ERROR_LEFT_OUT,
-            message("error_left_out.window", section=aid.section)
-            if key == "averaging_s"
-            else message("error_left_out.change", section=aid.section, name=key),
+            message("error_left_out.change", section=aid.section, name=key),
             sensor=aid.label,
         )
         for aid in trial.aids
         for key in aid.settings.left_out
+        if key != "averaging_s"
     ]
+    return changes + windows_left_out(trial.aids)
 
 
 def _notes(trial: Trial) -> tuple[Finding, ...]:

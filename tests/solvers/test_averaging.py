@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -12,7 +13,9 @@ from scipy.stats import chi2
 from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.solvers.batch import solve
 
 MOUNT = (
@@ -115,3 +118,16 @@ def test_single_beams_average_too():
     assert abs(length.value[0] - 0.5) < 4.0 * length.std[0] < 0.2
     assert np.all(np.abs(arm.value - [1.0, 1.2, 1.4]) < 4.0 * arm.std)
     assert np.all(arm.std < 0.02)
+
+
+def test_a_window_that_is_left_out_is_said_of_single_beams_too():
+    plan = yaml.safe_load((CONFIGS / "cruise-beams.yaml").read_text(encoding="utf-8"))
+    plan["manoeuvres"] = [{"straight_s": 5}]
+    trial = simulate(parse_scenario(plan), 1)
+    assert windows_left_out(trial.aids) == []
+    settings = msgspec.structs.replace(trial.beams.settings, averaging_s=0.5)
+    averaging = replace(trial.beams, settings=settings)
+    aids = [averaging if aid is trial.beams else aid for aid in trial.aids]
+    (found,) = windows_left_out(aids)
+    assert found.code == Code.ERROR_LEFT_OUT
+    assert "dvl_beams.averaging_s" in found.text
