@@ -171,25 +171,20 @@ def minimise(
             promised = _promised(problem, evaluation, gaussian, delta)
         assert delta is not None
         past = [*past[-_MEMORY:], (evaluation.values, delta)] if damping == 0.0 else []
-        trial = problem.evaluate(evaluation.values.retract(delta))
-        slowly = promised > max(tolerance, _NEARLY, _POOR_GAIN * before)
-        if slowly and len(past) > 1 and problem.parameters:
-            trial = min(trial, _extrapolated(problem, past), key=lambda each: each.cost)
+        if promised > max(tolerance, _NEARLY):
+            changed = past if promised > _POOR_GAIN * before else past[-1:]
+            trial = _tried(problem, evaluation, delta, promised, changed)
+        else:
+            trial = problem.evaluate(evaluation.values.retract(delta))
         before = promised
-        if (
-            promised > max(tolerance, _NEARLY)
-            and evaluation.cost - trial.cost < _POOR_GAIN * promised
-        ):
-            trial = _shorter(problem, evaluation, delta, promised, trial)
-        slow = evaluation.cost - trial.cost < _POOR_GAIN * promised
-        if promised > _WITHIN and slow and damping == 0.0:
-            bent = _bent(problem, evaluation, delta, ordering)
-            trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
-            gaussian = problem.linearize(evaluation)
-            fallen = evaluation.cost - trial.cost
+        fallen = evaluation.cost - trial.cost
+        if promised > _WITHIN and fallen < _POOR_GAIN * promised and damping == 0.0:
             if not held and fallen < _HARDLY * promised and _at_jump(problem, evaluation, delta):
                 held, past, root = True, [], None
                 continue
+            bent = _bent(problem, evaluation, delta, ordering)
+            trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
+            gaussian = problem.linearize(evaluation)
         lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
         small = promised < tolerance
         if np.isfinite(trial.cost) and (lower or small):
@@ -247,6 +242,34 @@ def _promised(
     """Return by how much the linear model says that the cost falls."""
     beside = 0.0 if problem.tilt is None else problem.tilt.constant
     return float(evaluation.cost + beside - gaussian.error(delta))
+
+
+def _tried(
+    problem: Problem,
+    evaluation: Evaluation,
+    delta: gtsam.VectorValues,
+    promised: float,
+    past: Sequence[tuple[gtsam.Values, gtsam.VectorValues]],
+) -> Evaluation:
+    """Return the lowest of where a step, less of it, and what the last ones lead to end.
+
+    Parameters
+    ----------
+    problem, evaluation : Problem or Evaluation
+        What is minimised, and where.
+    delta : gtsam.VectorValues
+        Step of the linear model.
+    promised : float
+        By how much it says that the cost falls.
+    past : sequence of tuple of gtsam.Values and gtsam.VectorValues
+        As of `_extrapolated`; that of one step says nothing.
+    """
+    trial = problem.evaluate(evaluation.values.retract(delta))
+    if len(past) > 1 and problem.parameters:
+        trial = min(trial, _extrapolated(problem, past), key=lambda each: each.cost)
+    if evaluation.cost - trial.cost < _POOR_GAIN * promised:
+        trial = _shorter(problem, evaluation, delta, promised, trial)
+    return trial
 
 
 def _at_jump(problem: Problem, evaluation: Evaluation, delta: gtsam.VectorValues) -> bool:
