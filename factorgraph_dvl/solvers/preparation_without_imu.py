@@ -59,6 +59,9 @@ _DENSITY = 1e-3
 # Share of the time between nodes by which their attitudes are earlier. Where a ping is at a node
 # of attitudes, their acceleration jumps, and clocks may stay there: half-way is farthest.
 _EARLY = 0.5
+# Share of it by which clocks may move them before other nodes take their place: those have another
+# likelihood, beside which strengths do not compare. Chosen: half the way to a ping.
+_MOVED = 0.25
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
 LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
@@ -156,6 +159,10 @@ class PreparationWithoutImu:
         """Return the strengths of motion and noise that residuals ask for."""
         found = motion_strengths(problem, minimum, self.phase, self.least_gain)
         chain, values = found.chain, minimum.evaluation.parameters
+        interval = float(np.median(np.diff(chain.node_time)))
+        early = chain.shift(values) - chain.attitude_shift
+        if abs(early - _EARLY * interval) < _MOVED * interval:
+            return found
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
         axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
