@@ -62,6 +62,8 @@ _EARLY = 0.5
 # Share of it by which clocks may move them before other nodes take their place: those have another
 # likelihood, beside which strengths do not compare. Chosen: half the way to a ping.
 _MOVED = 0.25
+# Share of it from which on the interval of attitudes is about as long. Chosen: one in between.
+_RARE = 0.7
 # Least densities, m²/s³ and rad²/s³. Chosen: they keep the chain regular.
 LEAST_DENSITY = np.repeat([1e-12, 1e-9], 3)
 # Spans, s, over which changes of velocity on legs show the density; in turns, in which velocity
@@ -161,7 +163,8 @@ class PreparationWithoutImu:
         chain, values = found.chain, minimum.evaluation.parameters
         interval = float(np.median(np.diff(chain.node_time)))
         early = chain.shift(values) - chain.attitude_shift
-        if abs(early - _EARLY * interval) < _MOVED * interval:
+        moved = abs(early - _EARLY * interval)
+        if _sparse(self.record, interval) or moved < _MOVED * interval:
             return found
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
@@ -210,7 +213,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
     phase = phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
-    early = _early(nodes)
+    early = _early(record, nodes + late - lag)
     states = _states(record, track, frame, nodes - lag, late, early)
     chain = SmoothChain(
         frame=frame,
@@ -302,15 +305,37 @@ def _anew(
 
     Clocks have moved pings between nodes of the attitude; at a node they would stay.
     """
-    shift = chain.shift(values) - _early(chain.node_time)
+    shift = chain.shift(values) - _EARLY * float(np.median(np.diff(chain.node_time)))
     motion = chain.motion(chain.attach(chain.node_time, shift), states)
     own = SmoothStates(motion.nRb, states.p_n, states.v_n, motion.omega_eb_b)
     return replace(chain, attitude_time=chain.node_time + shift), own
 
 
-def _early(nodes: Array) -> float:
-    """Return by how much attitudes of nodes are earlier than the rest of them, s."""
-    return _EARLY * float(np.median(np.diff(nodes)))
+def _early(record: AttitudeRecord, stamps: Array) -> float:
+    """Return by how much attitudes of nodes are earlier than the rest of them, s.
+
+    Where attitudes are as rare as nodes, those of nodes are when one was measured: between them
+    rates are known less well, and by that clocks move.
+
+    Parameters
+    ----------
+    record : AttitudeRecord
+        Attitudes.
+    stamps : ndarray, shape (K,), s
+        Times of the nodes by the clock of attitudes.
+    """
+    interval = float(np.median(np.diff(stamps)))
+    if not _sparse(record, interval):
+        return _EARLY * interval
+    before = np.searchsorted(record.time, stamps, side="right") - 1
+    turn = 2.0 * np.pi / record.interval
+    since = turn * (stamps - record.time[np.maximum(before, 0)])
+    return float(np.angle(np.mean(np.exp(1j * since))) % (2.0 * np.pi)) / turn
+
+
+def _sparse(record: AttitudeRecord, interval: float) -> bool:
+    """Whether attitudes are about as rare as nodes at an interval, s."""
+    return record.interval > _RARE * interval
 
 
 def _states(
