@@ -16,6 +16,7 @@ from reports import build_result
 from factorgraph_dvl.report.html.page import comparison_page, report_page
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+WebDriverWait = pytest.importorskip("selenium.webdriver.support.wait").WebDriverWait
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None or DRIVER is None, reason="chromium and chromedriver are not installed"
@@ -43,6 +44,10 @@ def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
     along = np.array([0.0, 300.0, 600.0]), ("misalignment_x_deg",), np.array([[9.0], [1], [0.1]])
     file.write_text(report_page(build_result(history=along)), encoding="utf-8")
     driver.get(file.as_uri())
+    # On a busy machine scripts end a while after the page has been read.
+    WebDriverWait(driver, 30).until(
+        lambda d: d.execute_script("return document.documentElement.dataset.drawn")
+    )
     return driver
 
 
