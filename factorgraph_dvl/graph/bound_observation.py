@@ -150,8 +150,8 @@ class BoundObservation:
 
     @property
     def of_attitude(self) -> bool:
-        """Whether it measures attitude alone."""
-        return self.observation.unit == _ANGLE
+        """Whether it measures attitude alone, and attitudes of the chain are by themselves."""
+        return self.chain.attitude_clock is not None and self.observation.unit == _ANGLE
 
     def window(self, parameters: Mapping[str, Array]) -> float | None:
         """Return the length of the window that measurements are means over, s; None = of none."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
@@ -148,7 +149,7 @@ def minimise(
     damping = 0.0
     # Greatest damping with which a step failed since the cost last fell.
     failed = -1.0
-    careful = held = False
+    careful = held = settled = False
     promised = before = np.inf
     # Where the last steps began, and what these were by the linear model there.
     past: list[tuple[gtsam.Values, gtsam.VectorValues]] = []
@@ -200,7 +201,7 @@ def minimise(
             if progress:
                 progress(stage, iteration, evaluation.cost)
             if ended and damping == 0.0 and held:
-                gaussian = problem.linearize(evaluation)
+                settled, gaussian = True, problem.linearize(evaluation)
                 break
             if ended and damping == 0.0 and (root is not None or not proven):
                 return Minimum(evaluation, root, True, iteration)
@@ -215,7 +216,7 @@ def minimise(
                 # Steps that small gain nothing, and larger ones fail: so it would go on.
                 break
         elif promised < _WITHIN and damping == 0.0 and held:
-            ended = True
+            settled = True
             break
         elif promised < _WITHIN and damping == 0.0 and (root is not None or not proven):
             return Minimum(evaluation, root, True, iteration)
@@ -230,7 +231,7 @@ def minimise(
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
     promised = _promised(problem, evaluation, gaussian, root.solution())
-    return Minimum(evaluation, root, promised < _WITHIN or (held and ended), iteration)
+    return Minimum(evaluation, root, promised < _WITHIN or settled, iteration)
 
 
 def _promised(
@@ -288,13 +289,7 @@ def _held(
     gaussian: gtsam.GaussianFactorGraph, clocks: Collection[int]
 ) -> gtsam.GaussianFactorGraph:
     """Return the graph with clocks that stay where they are."""
-    out = gtsam.GaussianFactorGraph()
-    for i in range(gaussian.size()):
-        out.push_back(gaussian.at(i))
-    unit = gtsam.noiseModel.Unit.Create(1)
-    for key in clocks:
-        out.add(key, np.full((1, 1), 1.0 / _STAYS), np.zeros(1), unit)
-    return out
+    return _kept_near(gaussian, {key: np.full(1, 1.0 / _STAYS) for key in clocks})
 
 
 def _extrapolated(
@@ -424,15 +419,21 @@ def _damped(
     gaussian: gtsam.GaussianFactorGraph, values: gtsam.Values, damping: float
 ) -> gtsam.GaussianFactorGraph:
     """Return the graph with Levenberg's damping on every variable."""
-    damped = gtsam.GaussianFactorGraph()
+    scales = {
+        key: 1.0 / _TRUSTED_STATE if size == _TRUSTED_STATE.size else np.ones(size)
+        for key, size in values.dims().items()
+    }
+    return _kept_near(gaussian, {key: np.sqrt(damping) * each for key, each in scales.items()})
+
+
+def _kept_near(
+    gaussian: gtsam.GaussianFactorGraph, weights: Mapping[int, Array]
+) -> gtsam.GaussianFactorGraph:
+    """Return the graph with variables kept near where they are, by weights (n,) of their steps."""
+    out = gtsam.GaussianFactorGraph()
     for i in range(gaussian.size()):
-        damped.push_back(gaussian.at(i))
-    for key, size in values.dims().items():
-        scale = 1.0 / _TRUSTED_STATE if size == _TRUSTED_STATE.size else np.ones(size)
-        damped.add(
-            key,
-            np.sqrt(damping) * np.diag(scale),
-            np.zeros(size),
-            gtsam.noiseModel.Unit.Create(size),
-        )
-    return damped
+        out.push_back(gaussian.at(i))
+    for key, weight in weights.items():
+        unit = gtsam.noiseModel.Unit.Create(weight.size)
+        out.add(key, np.diag(weight), np.zeros(weight.size), unit)
+    return out

@@ -103,7 +103,6 @@ def motion_strengths(
     assert isinstance(chain, SmoothChain)
     evaluation = problem.weighed(minimum.evaluation)
     information = minimum.information
-    step = information.solution()
     strengths = _strengths_of(problem, phase)
     score, gradient, covariance = _score(problem, evaluation, information, phase, strengths)
     wanted, gain = _step(strengths, score)
@@ -133,13 +132,13 @@ def motion_strengths(
         nodes = values[process.name].copy()
         nodes[:, : ratio.size] /= np.where(ratio > 0.0, ratio, 1.0)
         values[process.name] = nodes
-    moved = np.concatenate(
-        [step.at(problem.key(name)) for name in problem.columns] or [np.zeros(0)]
-    )
-    before = problem.tilt
-    if before is not None and before.hold is None:
+    if problem.tilt is not None and problem.tilt.hold is None:
         # At a minimum the step is this; where the slope jumps, the linear model has another.
-        moved = covariance @ before.gradient
+        moved = covariance @ problem.tilt.gradient
+    else:
+        step = information.solution()
+        every = [step.at(problem.key(name)) for name in problem.columns]
+        moved = np.concatenate(every or [np.zeros(0)])
     tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
     other = (np.abs(wanted) > _SAME) & (gain > least_gain)
     same = not other.any() and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS

@@ -162,14 +162,14 @@ class PreparationWithoutImu:
         found = motion_strengths(problem, minimum, self.phase, self.least_gain)
         chain, values = found.chain, minimum.evaluation.parameters
         interval = float(np.median(np.diff(chain.node_time)))
-        early = chain.shift(values) - chain.attitude_shift
-        moved = abs(early - _EARLY * interval)
+        shift = chain.shift(values) - _EARLY * interval
+        moved = abs(shift - chain.attitude_shift)
         if _sparse(self.record, interval) or moved < _MOVED * interval:
             return found
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
         axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
-        chain, states = _anew(replace(chain, nRt=axes), minimum.evaluation.states, values)
+        chain, states = _anew(replace(chain, nRt=axes), minimum.evaluation.states, shift)
         return replace(found, chain=chain, states=states)
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
@@ -299,13 +299,12 @@ def _followed(o: Observation, nodes: Array) -> bool:
 
 
 def _anew(
-    chain: SmoothChain, states: ChainStates, values: Mapping[str, Array]
+    chain: SmoothChain, states: ChainStates, shift: float
 ) -> tuple[SmoothChain, SmoothStates]:
-    """Return a chain whose attitudes are as early as at first, and its states.
+    """Return a chain whose attitudes are later than its nodes by a shift, s, and its states.
 
     Clocks have moved pings between nodes of the attitude; at a node they would stay.
     """
-    shift = chain.shift(values) - _EARLY * float(np.median(np.diff(chain.node_time)))
     motion = chain.motion(chain.attach(chain.node_time, shift), states)
     own = SmoothStates(motion.nRb, states.p_n, states.v_n, motion.omega_eb_b)
     return replace(chain, attitude_time=chain.node_time + shift), own

@@ -211,9 +211,8 @@ def log_determinant_gradient(
             return total(p, value)
         return sum(known[b.observation.label] for b in problem.bound if p.name in b.names)
 
-    clocks = {name for bound in problem.bound for name in bound.clocks}
     for p in problem.parameters:
-        if p.name in clocks:
+        if problem.key(p.name) in problem.clock_keys:
             continue
         value, own = evaluation.parameters[p.name], problem.columns[p.name]
         at_value = before(p, value)

@@ -86,19 +86,16 @@ class Curved:
     """
 
     tilt = None
-    weights = ()
 
     def __init__(self, curvature, jump=0.0):
         self.parameters = tuple(SimpleNamespace(name=name) for name in ("scale", "clock"))
         self.clock_keys = [1]
         self._curvature, self._jump = curvature, jump
-        self.evaluations = 0
 
     def key(self, name):
         return ("scale", "clock").index(name)
 
     def evaluate(self, values):
-        self.evaluations += 1
         x, t = values.atVector(0)[0] - 2.0, values.atVector(1)[0]
         cost = 10.0 + 0.5 * self._curvature * x**2 + self._jump * abs(t) + 0.5 * (t - 0.1) ** 2
         return SimpleNamespace(values=values, parameters={}, cost=cost)
