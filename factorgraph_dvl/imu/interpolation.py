@@ -35,12 +35,13 @@ _NARROW = 2 * _HALF_WIDTHS[0] + 1
 # too long.
 _REPEATED = 30.0
 _BLOCK = 500
-# Frequency, Hz, above which motion is vibration, and half-width of the filter that takes it off, s.
-# Chosen: a ping or a Doppler measurement takes about a tenth of a second, and whether it follows
-# what is faster is not known; no hull sways at 8 Hz. Measured: a propeller of 24 Hz, 1.8 m from
-# the IMU, gave the clock of an INS a minimum every 42 ms.
+# Frequency, Hz, above which motion is vibration, half-width of the filter that takes it off, s,
+# and widths that a record must have to show what goes on. Chosen: a ping or a Doppler measurement takes about a tenth of a second, and whether it
+# follows what is faster is not known; no hull sways at 8 Hz. Measured: a propeller of 24 Hz,
+# 1.8 m from the IMU, gave the clock of an INS a minimum every 42 ms.
 _VIBRATION = 8.0
-_FILTER = 0.25
+_FILTER = 0.5
+_GOES_ON = 10
 # Standard deviations of its power by which vibration exceeds noise. Chosen: chance never does.
 _SURE = 5.0
 # Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
@@ -109,7 +110,7 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
     few = values[:_ENOUGH]
     vibration = _vibration(few, dt, sigma)
     motion = few if vibration is None else few - vibration
-    best, width = sigma**2 + _power(vibration), 0
+    best, width = sigma**2 + _power(vibration, dt), 0
     for half in _HALF_WIDTHS:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
@@ -120,8 +121,8 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
         by_noise = sigma**2 * (1.0 - 2.0 * weights[half] + kept)
         by_motion = max(float(np.mean(moved)) - by_noise, 0.0)
         chance = 1.25 * by_noise * np.sqrt(2.0 * window / few.size)
-        by_sway = max(float(np.median(_means(moved))) - by_noise - chance, 0.0)
-        left = 0.0 if vibration is None else _power(_filtered(vibration, window))
+        by_sway = max(float(np.median(_means(moved, _BLOCK))) - by_noise - chance, 0.0)
+        left = 0.0 if vibration is None else _power(_filtered(vibration, window), dt)
         error = by_motion + (_REPEATED - 1.0) * by_sway + left + sigma**2 * kept
         if error < best:
             best, width = error, window
@@ -131,7 +132,7 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
 def _vibration(values: Array, dt: float, sigma: float) -> Array | None:
     """Return what is faster than motion and goes on, (N, 3); None where that is only noise."""
     half = round(_FILTER / dt)
-    if 4.0 * _VIBRATION * dt > 1.0 or 2 * half >= values.shape[0]:
+    if 4.0 * _VIBRATION * dt > 1.0 or _GOES_ON * 2 * half > values.shape[0]:
         return None
     taps = np.sinc(2.0 * _VIBRATION * dt * np.arange(-half, half + 1)) * np.blackman(2 * half + 1)
     passed = -taps / taps.sum()
@@ -139,17 +140,22 @@ def _vibration(values: Array, dt: float, sigma: float) -> Array | None:
     fast = np.asarray(correlate1d(values, passed, axis=0, mode="nearest"))
     by_noise = sigma**2 * float(passed @ passed)
     chance = 1.25 * by_noise * np.sqrt(2.0 / values.size)
-    return fast if _power(fast) > by_noise + _SURE * chance else None
+    return fast if _power(fast, dt) > by_noise + _SURE * chance else None
 
 
-def _power(fast: Array | None) -> float:
-    """Return the mean square of a component of a signal, in the middle of its blocks."""
-    return 0.0 if fast is None else float(np.median(_means(np.mean(fast**2, axis=1))))
+def _power(fast: Array | None, dt: float) -> float:
+    """Return the mean square of a vibration, the median of that of short times.
+
+    A step is fast only for a short time.
+    """
+    if fast is None:
+        return 0.0
+    return float(np.median(_means(np.mean(fast**2, axis=1), round(2.0 * _FILTER / dt))))
 
 
-def _means(values: Array) -> Array:
-    """Return the means of blocks of values, (B,)."""
-    blocks = max(values.size // _BLOCK, 1)
+def _means(values: Array, size: int) -> Array:
+    """Return the means of blocks of so many values, (B,)."""
+    blocks = max(values.size // size, 1)
     whole = values[: blocks * (values.size // blocks)]
     return np.asarray(whole.reshape(blocks, -1).mean(axis=1))
 

@@ -18,11 +18,11 @@ def noise(sigma):
 
 def test_the_more_motion_the_narrower_the_window():
     white = noise(1e-3)
-    slow, fast = (np.sin(2 * np.pi * f * TIME)[:, None] * np.ones(3) + white for f in (0.2, 8.0))
+    slow, fast = (np.sin(2 * np.pi * f * TIME)[:, None] * np.ones(3) + white for f in (0.2, 4.0))
     assert best_window(white, DT, 1e-3) == 51
     assert best_window(white, DT, 1e-3) >= best_window(slow, DT, 1e-3)
     assert best_window(slow, DT, 1e-3) > best_window(fast, DT, 1e-3)
-    assert best_window(fast, DT, 1e-9) == 0
+    assert best_window(fast - white, DT, 1e-9) == 0
 
 
 @pytest.mark.parametrize("count", [TIME.size, 200])
@@ -103,3 +103,23 @@ def test_samples_that_are_left_alone_have_their_own_noise():
     assert unsmoothed(DT, 1e-3).spline is None
     assert unsmoothed(DT, 1e-3).slope_sigma == pytest.approx(0.2)
     assert smooth(TIME[:5], noise(1.0)[:5], DT, 1.0, averaged=False, window=11).window == 0
+
+
+def test_vibration_is_taken_out_and_a_sway_beside_it_is_not():
+    sway = np.sin(2.0 * np.pi * 0.5 * TIME)[:, None] * np.ones(3)
+    vibration = 0.02 * np.sin(2.0 * np.pi * 24.0 * TIME)[:, None] * np.ones(3)
+    white = noise(1e-4)
+    assert best_window(sway, DT, 1e-9) == 0
+    window = best_window(sway + vibration + white, DT, 1e-4)
+    found = smooth(TIME, sway + vibration + white, DT, 1e-4, averaged=False, window=window)
+    at = np.arange(1.0, 9.0, 0.0137)
+    value, _, misfit = found.at(at)
+    off = value - np.sin(2.0 * np.pi * 0.5 * at)[:, None]
+    assert np.sqrt(np.mean(off**2)) < 0.15 * np.sqrt(np.mean(vibration**2))
+    # It counts as noise of what is measured at a moment.
+    assert np.sqrt(np.mean(misfit**2)) > 0.5 * np.sqrt(np.mean(vibration**2))
+
+
+def test_what_is_fast_for_a_moment_is_no_vibration():
+    step = np.where(TIME > 5.0, 1.0, 0.0)[:, None] * np.ones(3)
+    assert best_window(step, DT, 1e-6) == 0

@@ -93,3 +93,20 @@ def test_a_late_gnss_is_found_from_far_away(offset):
     found = solve(late).estimate("gnss_time_offset_s")
     assert found.std[0] < 0.05
     assert abs(found.value[0] - offset) < 4.0 * found.std[0]
+
+
+def test_vibration_of_the_imu_leaves_the_clock_of_gnss_one_minimum():
+    """A propeller turns the IMU to and fro; what GNSS measures far from it is a mean over that."""
+    antenna = {
+        "velocity_std_m_s": [0.003, 0.003, 0.003],
+        "lever_arm_m": [0.0, 2.0, 0.0],
+        "lever_arm_error_m": [0.1, -0.1, 0.0],
+    }
+    stated = {"gnss": {"time_offset_std_s": 5.0, "lever_arm_std_m": [1.0, 1.0, 1.0]}}
+    trial = simulate(scenario(noise=True, gnss=GNSS | antenna, trial=stated), 1)
+    turning = np.radians(0.3) * np.cos(2.0 * np.pi * 24.0 * trial.imu.time)
+    shaken = replace(trial.imu, gyro=trial.imu.gyro + turning[:, None])
+    late = replace(trial, imu=shaken, gnss=replace(trial.gnss, time=trial.gnss.time + 0.4))
+    found = solve(late).estimate("gnss_time_offset_s")
+    assert found.std[0] < 0.01
+    assert abs(found.value[0] - 0.4) < 3.0 * found.std[0]
