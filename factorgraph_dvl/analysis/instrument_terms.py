@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body, wrapped
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.verdict import Grade, grades
@@ -64,9 +65,11 @@ class InstrumentTerms:
         Grades of the components of the lever arm.
     origin : str
         Where the lever arm starts: `IMU`, `INS` or `GNSS antenna`.
+    body_axes : BodyAxes
+        Names of the axes of the vehicle.
     alignment : ndarray, shape (3,)
-        TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates for d, C_b^d =
-        Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
+        TRDI's EA, EI, EJ, deg: C_b^d = Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down, with
+        the recorded axes named as `axes_as` does it for TRDI.
     alignment_std : ndarray, shape (3,), deg
         Standard deviations of `alignment`.
     axes : ndarray, shape (3, 3)
@@ -84,6 +87,7 @@ class InstrumentTerms:
     lever_arm_covariance: Array
     lever_arm_grade: tuple[Grade, ...]
     origin: str
+    body_axes: BodyAxes
     alignment: Array
     alignment_std: Array
     axes: Array
@@ -91,8 +95,46 @@ class InstrumentTerms:
     @property
     def attitude(self) -> Array:
         """C_d^b, the attitude of the DVL in the vehicle, (3, 3), in forward, starboard, down."""
-        angles = self.dvl_in_body["ZYX"].value[::-1]
-        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+        return attitude_of(self.axes, self.body_axes)
+
+    def axes_as(self, maker: BodyAxes) -> BodyAxes:
+        """Return the names of the recorded axes: a maker's if it then looks down, else the body's.
+
+        Parameters
+        ----------
+        maker : BodyAxes
+            Names of the axes in which an aligned DVL of this maker measures.
+        """
+        return axes_as(self.axes, maker, self.body_axes)
+
+    def attitude_as(self, maker: BodyAxes) -> Array:
+        """Return C_d^b, (3, 3), in forward, starboard, down, with axes named by `axes_as`."""
+        return attitude_of(self.axes, self.axes_as(maker))
+
+    @property
+    def rotation_offset(self) -> float:
+        """Water Linked's angle from the vehicle's forward axis to that of the DVL, deg, clockwise.
+
+        It is from 0 to below 360, to a hundredth of a degree.
+        """
+        yaw = euler(self.attitude_as(WATER_LINKED_AXES), "ZYX")[2]
+        return round(float(yaw), 2) % 360.0
+
+
+# Axes of an aligned DVL that looks down, by maker.
+TRDI_AXES: BodyAxes = "RFU"
+NORTEK_AXES: BodyAxes = "FRD"
+WATER_LINKED_AXES: BodyAxes = "FRD"
+
+
+def attitude_of(axes: Array, named: BodyAxes) -> Array:
+    """Return C_d^b, (3, 3), in forward, starboard, down, of recorded axes with these names."""
+    return np.asarray((frd_from_body(named) @ axes).T)
+
+
+def axes_as(axes: Array, maker: BodyAxes, body: BodyAxes) -> BodyAxes:
+    """Return the names of recorded axes: a maker's if the DVL looks down so, or the body's."""
+    return maker if looks_down(attitude_of(axes, maker)) else body
 
 
 def has_instrument_terms(calibration: Calibration | Solution) -> bool:
@@ -127,8 +169,8 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     seen = next(e.observable for e in calibration.estimates if e.name == MISALIGNMENT)
     limit = calibration.limits.get(MISALIGNMENT, np.inf)
     frd = frd_from_body(calibration.body_axes)
-    # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.
-    trdi = frd_from_body("RFU")
+    recorded = exp_so3(alpha * DEG) @ frd.T
+    trdi = frd_from_body(axes_as(recorded, TRDI_AXES, calibration.body_axes))
 
     def angles(of: Callable[[Array], Array]) -> Angles:
         """Return angles that depend on the rotation vector, and their standard deviations."""
@@ -169,9 +211,10 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         lever_arm_covariance=lever_covariance,
         lever_arm_grade=tuple(graded[LEVER_ARM][i] for i in np.argmax(np.abs(frd), axis=1)),
         origin=_origin(calibration.inputs),
+        body_axes=calibration.body_axes,
         alignment=alignment.value,
         alignment_std=alignment.std,
-        axes=exp_so3(alpha * DEG) @ frd.T,
+        axes=recorded,
     )
 
 

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
+from factorgraph_dvl.analysis.instrument_terms import (
+    NORTEK_AXES,
+    TRDI_AXES,
+    WATER_LINKED_AXES,
+    InstrumentTerms,
+    euler,
+)
+from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
 from factorgraph_dvl.quality.verdict import Grade
@@ -23,15 +30,29 @@ REFUSED = {
 }
 # What must be checked before the names of a maker are used, by the first word of them.
 _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
-_UNVERIFIED = "The maker's signs are not verified against its manual: check one before use."
 _REMARKS = {
-    "TRDI": (_AT_ZERO, "The sign of EA is not verified against a manual: check it before use."),
-    "Nortek": (_UNVERIFIED,),
+    "TRDI": (_AT_ZERO,),
+    "Nortek": (
+        "The maker's manuals confirm the sign of yaw. Those of roll and pitch are assumed: check "
+        "one before use.",
+    ),
     "Water": (_AT_ZERO,),
-    "Delph": (_UNVERIFIED,),
+    "Delph": (
+        "The maker's manual confirms the signs of the lever arm. Those of the angles are assumed: "
+        "check one before use.",
+    ),
 }
-# Chosen: a DVL that looks down has a smaller roll and pitch.
-_LOOKS_UP_DEG = 90.0
+# How a maker's numbers name the axes x, y, z of the record.
+RECORDED_AXES = {
+    "RFU": "The axes x, y, z of the record are taken as starboard, forward, up of the DVL.",
+    "FRD": "The axes x, y, z of the record are taken as forward, starboard, down of the DVL.",
+    "FLU": "The axes x, y, z of the record are taken as forward, port, up of the DVL.",
+}
+_OTHER_AXES = (
+    "With its axes named as those of the body, the DVL would not look down: the angles contain "
+    "the turn between the axes of the two instruments."
+)
+_MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water": WATER_LINKED_AXES}
 
 
 @dataclass(frozen=True)
@@ -130,15 +151,15 @@ def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
     maker : str, optional
         Maker of the DVL: what must be checked before its own names are used comes last.
     """
+    known = next((name.split()[0] for name, *_ in maker_rows(i, maker)), "")
+    named = i.axes_as(_MAKER_AXES[known]) if known in _MAKER_AXES else None
     return (
         "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
         "Do not enter red or grey values.",
         f"Lever arm: from the {i.origin} to the DVL.",
-        *dict.fromkeys(
-            remark
-            for name, *_ in maker_rows(i, maker)
-            for remark in _REMARKS.get(name.split()[0], ())
-        ),
+        *([] if looks_down(i.attitude) else [_OTHER_AXES]),
+        *([] if named is None else [RECORDED_AXES[named]]),
+        *_REMARKS.get(known, ()),
     )
 
 
@@ -162,11 +183,11 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
     maker : str
         Maker as a certificate names it; there are no rows for a maker that is not known.
     """
-    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     angles = ("roll", "pitch", "yaw")
     clockwise = "clockwise from above"
     known = maker.lower()
-    if any(name in known for name in ("trdi", "rdi", "teledyne")) and not looks_up_for_trdi(i):
+    is_trdi = any(name in known for name in ("trdi", "rdi", "teledyne"))
+    if is_trdi and looks_down(i.attitude_as(TRDI_AXES)):
         rules = (clockwise, "ship: port side up", "ship: bow up")
         return [
             (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", rule, angles)
@@ -174,16 +195,19 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
         ]
     if "nortek" in known:
         rules = ("starboard down", "bow up", "to starboard")
+        values = euler(i.attitude_as(NORTEK_AXES), "ZYX").tolist()
         return [
             (f"Nortek {name}", fixed(a, 2), "deg", rule, angles)
-            for name, a, rule in zip(angles, (roll, pitch, yaw), rules, strict=True)
+            for name, a, rule in zip(angles, values, rules, strict=True)
         ]
-    if any(name in known for name in ("water linked", "waterlinked")) and not looks_up(i):
-        offset = f"{round(yaw) % 360}"
-        return [("Water Linked mounting_rotation_offset", offset, "deg", clockwise, ("yaw",))]
+    is_water_linked = any(name in known for name in ("water linked", "waterlinked"))
+    if is_water_linked and looks_down(i.attitude_as(WATER_LINKED_AXES)):
+        name, offset = "Water Linked mounting_rotation_offset", fixed(i.rotation_offset, 2)
+        return [(name, offset, "deg", clockwise, ("yaw",))]
     if any(name in known for name in ("exail", "ixblue", "delph")):
+        roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
         forward, starboard, down = (float(x) for x in i.lever_arm)
-        arm = (("X1", forward, "ahead"), ("X2", -starboard, "to port"), ("X3", -down, "above"))
+        arm = (("XV1", forward, "ahead"), ("XV2", -starboard, "to port"), ("XV3", -down, "above"))
         return [
             ("Delph heading", fixed(yaw, 2), "deg", clockwise, angles),
             ("Delph pitch", fixed(-pitch, 2), "deg", "bow down", angles),
@@ -191,16 +215,6 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
             *((f"Delph {name}", fixed(x, 3), "m", rule, ("lever_arm",)) for name, x, rule in arm),
         ]
     return []
-
-
-def looks_up(i: InstrumentTerms) -> bool:
-    """Return whether the DVL looks up as it is mounted."""
-    return bool(np.max(np.abs(i.dvl_in_body["ZYX"].value[:2])) > _LOOKS_UP_DEG)
-
-
-def looks_up_for_trdi(i: InstrumentTerms) -> bool:
-    """Return whether TRDI's commands would make the DVL look up."""
-    return bool(np.max(np.abs(i.alignment[1:])) > _LOOKS_UP_DEG)
 
 
 def hundredths(angle: float) -> int:

@@ -168,7 +168,7 @@ def test_the_lever_arm_starts_where_body_quantities_do() -> None:
     [
         ("Teledyne RDI", {"TRDI EA": "1000", "TRDI EI": "0", "TRDI EJ": "0"}),
         ("Nortek", {"Nortek roll": "0.00", "Nortek pitch": "0.00", "Nortek yaw": "10.00"}),
-        ("Water Linked AS", {"Water Linked mounting_rotation_offset": "10"}),
+        ("Water Linked AS", {"Water Linked mounting_rotation_offset": "10.00"}),
         ("someone", {}),
     ],
 )
@@ -178,7 +178,7 @@ def test_the_maker_s_own_names_are_in_the_table(maker: str, rows: dict[str, str]
     assert {plain(row[0]): row[1] for row in table.rows[7:]} == rows
     # Each has its sign rule, and the caption says what to check first.
     assert all(plain(row[3]) for row in table.rows)
-    assert len(conventions(terms, maker)) == 3 + (2 if maker == "Teledyne RDI" else bool(rows))
+    assert len(conventions(terms, maker)) == 3 + 2 * bool(rows)
     for phrase in (*conventions(terms, maker), *(plain(row[3]) for row in table.rows)):
         assert chinese(phrase) != phrase
 
