@@ -53,6 +53,9 @@ class InstrumentTerms:
     ----------
     dvl_in_body, body_to_dvl : dict of Order to Angles
         Angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d, by order.
+    as_frd : Angles
+        Angles of C_d^b, ZYX, for makers whose axes are forward, starboard, down: with the recorded
+        axes named as `axes_as` does it for them.
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
     scale_grade : tuple of Grade
@@ -79,6 +82,7 @@ class InstrumentTerms:
 
     dvl_in_body: dict[Order, Angles]
     body_to_dvl: dict[Order, Angles]
+    as_frd: Angles
     scale_error: Array
     scale_std: Array
     scale_grade: tuple[Grade, ...]
@@ -115,10 +119,9 @@ class InstrumentTerms:
     def rotation_offset(self) -> float:
         """Water Linked's angle from the vehicle's forward axis to that of the DVL, deg, clockwise.
 
-        It is from 0 to below 360, to a hundredth of a degree.
+        It is from 0 to 360.
         """
-        yaw = euler(self.attitude_as(WATER_LINKED_AXES), "ZYX")[2]
-        return round(float(yaw), 2) % 360.0
+        return float(self.as_frd.value[2]) % 360.0
 
 
 # Axes of an aligned DVL that looks down, by maker.
@@ -171,6 +174,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     frd = frd_from_body(calibration.body_axes)
     recorded = exp_so3(alpha * DEG) @ frd.T
     trdi = frd_from_body(axes_as(recorded, TRDI_AXES, calibration.body_axes))
+    named = frd_from_body(axes_as(recorded, "FRD", calibration.body_axes))
 
     def angles(of: Callable[[Array], Array]) -> Angles:
         """Return angles that depend on the rotation vector, and their standard deviations."""
@@ -183,6 +187,9 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         # An angle is as observable as the component that adds most to its standard deviation.
         most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
         return Angles(value, std, grades(std, seen[most], limit))
+
+    def frd_angles(vector: Array) -> Array:
+        return euler((named @ exp_so3(vector * DEG) @ frd.T).T, "ZYX")
 
     def rpy(order: Order, *, inverse: bool) -> Angles:
         def of(vector: Array) -> Array:
@@ -203,6 +210,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     return InstrumentTerms(
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
+        as_frd=angles(frd_angles),
         scale_error=scale,
         scale_std=np.sqrt(np.diag(scale_covariance)),
         scale_grade=graded[SCALE_ERROR],

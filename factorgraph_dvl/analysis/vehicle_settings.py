@@ -17,7 +17,6 @@ from factorgraph_dvl.analysis.instrument_terms import (
     ORIGINS,
     WATER_LINKED_AXES,
     InstrumentTerms,
-    euler,
     instrument_of,
 )
 from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
@@ -218,12 +217,11 @@ def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Line
 
     It is the direction of the DVL's forward axis seen from that of the vehicle.
     """
-    attitude = i.attitude_as(WATER_LINKED_AXES)
-    roll, pitch, _ = (float(x) for x in euler(attitude, "ZYX"))
-    if not looks_down(attitude):
+    roll, pitch, _ = (float(x) for x in i.as_frd.value)
+    if not looks_down(i.attitude_as(WATER_LINKED_AXES)):
         yield f"mounting_rotation_offset: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
-        parameters = {"mounting_rotation_offset": i.rotation_offset}
+        parameters = {"mounting_rotation_offset": round(i.rotation_offset, 2)}
         command = {"command": "set_config", "parameters": parameters}
         yield "Send this line to port 16171 of the DVL. Positive: clockwise from above."
         yield "It is valid if the offset was 0 in the trial."

@@ -241,7 +241,7 @@ def _print_campaign(found: Campaign) -> None:
         and expected.verdict.grade != "do not use"
         and has_instrument_terms(expected)
     ):
-        print_table(entries_table(instrument_of(expected)), "unit")
+        print_table(entries_table(instrument_of(expected)))
 
 
 def _end(failed: int, count: int) -> None:

@@ -61,7 +61,7 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         both = sum_with_compass(solution.findings)
         if both is not None and not events.active():
             stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)
-        print_table(entries_table(instrument_of(solution), maker), "unit")
+        print_table(entries_table(instrument_of(solution), maker))
     if not events.active():
         stdout().print(f"Open {page}", markup=False, soft_wrap=True)
 

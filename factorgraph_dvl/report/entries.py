@@ -12,11 +12,10 @@ from factorgraph_dvl.analysis.instrument_terms import (
     TRDI_AXES,
     WATER_LINKED_AXES,
     InstrumentTerms,
-    euler,
 )
 from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
+from factorgraph_dvl.quality.notation import at_precision, with_std
 from factorgraph_dvl.quality.verdict import Grade
 from factorgraph_dvl.report.table import Mark, Table
 from factorgraph_dvl.report.tables import GRADES
@@ -28,7 +27,13 @@ REFUSED = {
     "red": "σ is more than twice its limit",
     "grey": "the trial did not determine it",
 }
-# What must be checked before the names of a maker are used, by the first word of them.
+# Makers by words in the name of a maker, and what must be checked before their names are used.
+_MAKERS = {
+    "TRDI": ("rdi", "teledyne"),
+    "Nortek": ("nortek",),
+    "Water Linked": ("water linked", "waterlinked"),
+    "Delph": ("exail", "ixblue", "delph"),
+}
 _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
 _REMARKS = {
     "TRDI": (_AT_ZERO,),
@@ -36,7 +41,7 @@ _REMARKS = {
         "The maker's manuals confirm the sign of yaw. Those of roll and pitch are assumed: check "
         "one before use.",
     ),
-    "Water": (_AT_ZERO,),
+    "Water Linked": (_AT_ZERO,),
     "Delph": (
         "The maker's manual confirms the signs of the lever arm. Those of the angles are assumed: "
         "check one before use.",
@@ -52,7 +57,8 @@ _OTHER_AXES = (
     "With its axes named as those of the body, the DVL would not look down: the angles contain "
     "the turn between the axes of the two instruments."
 )
-_MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water": WATER_LINKED_AXES}
+_NO_ROWS = "The maker's own numbers are not given: with them, the DVL would not look down."
+_MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water Linked": WATER_LINKED_AXES}
 
 
 @dataclass(frozen=True)
@@ -151,15 +157,20 @@ def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
     maker : str, optional
         Maker of the DVL: what must be checked before its own names are used comes last.
     """
-    known = next((name.split()[0] for name, *_ in maker_rows(i, maker)), "")
-    named = i.axes_as(_MAKER_AXES[known]) if known in _MAKER_AXES else None
+    known = _maker(maker)
+    has_rows = bool(maker_rows(i, maker))
     return (
         "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
         "Do not enter red or grey values.",
         f"Lever arm: from the {i.origin} to the DVL.",
         *([] if looks_down(i.attitude) else [_OTHER_AXES]),
-        *([] if named is None else [RECORDED_AXES[named]]),
-        *_REMARKS.get(known, ()),
+        *([_NO_ROWS] if known and not has_rows else []),
+        *(
+            [RECORDED_AXES[i.axes_as(_MAKER_AXES[known])]]
+            if has_rows and known in _MAKER_AXES
+            else []
+        ),
+        *(_REMARKS[known] if has_rows else ()),
     )
 
 
@@ -184,37 +195,49 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
         Maker as a certificate names it; there are no rows for a maker that is not known.
     """
     angles = ("roll", "pitch", "yaw")
-    clockwise = "clockwise from above"
-    known = maker.lower()
-    is_trdi = any(name in known for name in ("trdi", "rdi", "teledyne"))
-    if is_trdi and looks_down(i.attitude_as(TRDI_AXES)):
-        rules = (clockwise, "ship: port side up", "ship: bow up")
+    known = _maker(maker)
+    if known == "TRDI" and looks_down(i.attitude_as(TRDI_AXES)):
+        signs = ("to starboard", "ship: port up", "ship: bow up")
+        stds = 100.0 * i.alignment_std
         return [
-            (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", rule, angles)
-            for name, a, rule in zip(("EA", "EI", "EJ"), i.alignment, rules, strict=True)
+            (f"TRDI {name}", f"{hundredths(a)} ± {at_precision(s, s)}", "0.01 deg", rule, angles)
+            for name, a, s, rule in zip(("EA", "EI", "EJ"), i.alignment, stds, signs, strict=True)
         ]
-    if "nortek" in known:
+    if known == "Nortek":
         rules = ("starboard down", "bow up", "to starboard")
-        values = euler(i.attitude_as(NORTEK_AXES), "ZYX").tolist()
         return [
-            (f"Nortek {name}", fixed(a, 2), "deg", rule, angles)
-            for name, a, rule in zip(angles, values, rules, strict=True)
+            (f"Nortek {name}", with_std(a, std), "deg", rule, angles)
+            for name, a, std, rule in zip(angles, i.as_frd.value, i.as_frd.std, rules, strict=True)
         ]
-    is_water_linked = any(name in known for name in ("water linked", "waterlinked"))
-    if is_water_linked and looks_down(i.attitude_as(WATER_LINKED_AXES)):
-        name, offset = "Water Linked mounting_rotation_offset", fixed(i.rotation_offset, 2)
-        return [(name, offset, "deg", clockwise, ("yaw",))]
-    if any(name in known for name in ("exail", "ixblue", "delph")):
-        roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
-        forward, starboard, down = (float(x) for x in i.lever_arm)
-        arm = (("XV1", forward, "ahead"), ("XV2", -starboard, "to port"), ("XV3", -down, "above"))
+    if known == "Water Linked" and looks_down(i.attitude_as(WATER_LINKED_AXES)):
+        offset = with_std(i.rotation_offset, i.as_frd.std[2])
+        return [("Water Linked mounting rotation offset", offset, "deg", "to starboard", ("yaw",))]
+    if known == "Delph":
+        turned, arm = i.dvl_in_body["ZYX"], i.lever_arm
+        heading, pitch, roll = turned.value[::-1]
         return [
-            ("Delph heading", fixed(yaw, 2), "deg", clockwise, angles),
-            ("Delph pitch", fixed(-pitch, 2), "deg", "bow down", angles),
-            ("Delph roll", fixed(roll, 2), "deg", "port side up", angles),
-            *((f"Delph {name}", fixed(x, 3), "m", rule, ("lever_arm",)) for name, x, rule in arm),
-        ]
+            *(
+                (f"Delph {name}", with_std(x, std), "deg", rule, angles)
+                for name, x, std, rule in zip(
+                    ("heading", "pitch", "roll"), (heading, -pitch, roll), turned.std[::-1],
+                    ("to starboard", "bow down", "port side up"), strict=True,
+                )
+            ),
+            *(
+                (f"Delph XV{k}", with_std(x, std), "m", rule, ("lever_arm",))
+                for k, x, std, rule in zip(
+                    (1, 2, 3), (arm[0], -arm[1], -arm[2]), i.lever_arm_std,
+                    ("ahead", "to port", "above"), strict=True,
+                )
+            ),
+        ]  # fmt: skip
     return []
+
+
+def _maker(name: str) -> str:
+    """Return the maker that a name means, as rows name it; empty if it is not known."""
+    named = name.lower()
+    return next((m for m, words in _MAKERS.items() if any(w in named for w in words)), "")
 
 
 def hundredths(angle: float) -> int:

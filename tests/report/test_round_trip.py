@@ -60,7 +60,7 @@ def nortek(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
 
 def water_linked(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
     """Return velocities forward, starboard, down: the DVL's x axis is clockwise of the bow."""
-    angle = np.radians(typed["Water Linked mounting_rotation_offset"])
+    angle = np.radians(typed["Water Linked mounting rotation offset"])
     x, y, z = velocity.T
     forward = x * np.cos(angle) - y * np.sin(angle)
     return np.stack([forward, x * np.sin(angle) + y * np.cos(angle), z], axis=1)

@@ -14,7 +14,6 @@ from factorgraph_dvl.analysis.instrument_terms import (
     Angles,
     InstrumentTerms,
     Order,
-    euler,
     instrument_of,
 )
 from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
@@ -158,7 +157,7 @@ def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iter
     """Yield the calibration in the conventions of other makers, with their sign rules."""
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     water_linked = i.attitude_as(WATER_LINKED_AXES)
-    tilt = float(np.hypot(*euler(water_linked, "ZYX")[:2]))
+    tilt = float(np.hypot(*i.as_frd.value[:2]))
     mean = float(np.mean(i.scale_error))
     forward, starboard, down = (float(x) for x in i.lever_arm)
     yield from (
@@ -170,9 +169,7 @@ def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iter
         "# manual: check one of them before use.",
         f"# {RECORDED_AXES[i.axes_as(NORTEK_AXES)]}",
         "nortek:",
-        _line(
-            f"  roll_pitch_yaw_deg: {_list(euler(i.attitude_as(NORTEK_AXES), 'ZYX'), 2)}", angles
-        ),
+        _line(f"  roll_pitch_yaw_deg: {_list(i.as_frd.value, 2)}", angles),
         "",
         "# Water Linked: one angle, from the vehicle's forward axis to that of the DVL, positive",
         "# clockwise from above, from 0 to 360 deg; software before 2.2.1 takes whole degrees.",
