@@ -38,13 +38,13 @@ _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
 _REMARKS = {
     "TRDI": (_AT_ZERO,),
     "Nortek": (
-        "The maker's manuals confirm the sign of yaw. Those of roll and pitch are assumed: check "
-        "one before use.",
+        "The sign of yaw is the maker's. Those of roll and pitch are assumed: check one before "
+        "use.",
     ),
     "Water Linked": (_AT_ZERO,),
     "Delph": (
-        "The maker's manual confirms the signs of the lever arm. Those of the angles are assumed: "
-        "check one before use.",
+        "The signs of the lever arm are the maker's. Those of the angles are assumed: check one "
+        "before use.",
     ),
 }
 # How a maker's numbers name the axes x, y, z of the record.
