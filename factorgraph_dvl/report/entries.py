@@ -57,6 +57,10 @@ _OTHER_AXES = (
     "With its axes named as those of the body, the DVL would not look down: the angles contain "
     "the turn between the axes of the two instruments."
 )
+_MAKERS_NUMBERS = (
+    "instrument.yaml has the numbers as TRDI, Nortek, Water Linked and Exail define them. They "
+    "are here too if trial.yaml names the maker under `certificate`, `dvl`."
+)
 _NO_ROWS = "The maker's own numbers are not given: with them, the DVL would not look down."
 _MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water Linked": WATER_LINKED_AXES}
 
@@ -147,31 +151,33 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
     return table
 
 
+def definitions(i: InstrumentTerms) -> tuple[str, ...]:
+    """Return how the angles and the lever arm are defined."""
+    return (
+        "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
+        f"Lever arm: from the {i.origin} to the DVL.",
+        *([] if looks_down(i.attitude) else [_OTHER_AXES]),
+    )
+
+
 def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
-    """Return how angles and lever arm are defined, and which values must not be entered.
+    """Return how the numbers are defined, which to enter, and what a maker's own depend on.
 
     Parameters
     ----------
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str, optional
-        Maker of the DVL: what must be checked before its own names are used comes last.
+        Maker of the DVL.
     """
     known = _maker(maker)
-    has_rows = bool(maker_rows(i, maker))
-    return (
-        "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
-        "Do not enter red or grey values.",
-        f"Lever arm: from the {i.origin} to the DVL.",
-        *([] if looks_down(i.attitude) else [_OTHER_AXES]),
-        *([_NO_ROWS] if known and not has_rows else []),
-        *(
-            [RECORDED_AXES[i.axes_as(_MAKER_AXES[known])]]
-            if has_rows and known in _MAKER_AXES
-            else []
-        ),
-        *(_REMARKS[known] if has_rows else ()),
-    )
+    common = (*definitions(i), "Do not enter red or grey values.")
+    if not known:
+        return (*common, _MAKERS_NUMBERS)
+    if not maker_rows(i, maker):
+        return (*common, _NO_ROWS)
+    named = [RECORDED_AXES[i.axes_as(_MAKER_AXES[known])]] if known in _MAKER_AXES else []
+    return (*common, *named, *_REMARKS[known])
 
 
 def sum_with_compass(findings: Iterable[Finding]) -> Finding | None:

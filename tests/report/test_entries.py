@@ -179,7 +179,7 @@ def test_the_maker_s_own_names_are_in_the_table(maker: str, rows: dict[str, str]
     assert {name: value for name, (value, _) in shown.items()} == rows
     # Each has its sign rule, and the caption says what to check first.
     assert all(plain(row[3]) for row in table.rows)
-    assert len(conventions(terms, maker)) == 3 + 2 * bool(rows)
+    assert len(conventions(terms, maker)) == (5 if rows else 4)
     for phrase in (*conventions(terms, maker), *(plain(row[3]) for row in table.rows)):
         assert chinese(phrase) != phrase
 

@@ -19,13 +19,13 @@ from factorgraph_dvl.analysis.instrument_terms import (
 from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.notation import at_precision, fixed
+from factorgraph_dvl.quality.notation import at_precision, fixed, sentence
 from factorgraph_dvl.quality.verdict import Grade, Verdict
 from factorgraph_dvl.report.entries import (
     RECORDED_AXES,
     REFUSED,
     TITLE,
-    conventions,
+    definitions,
     entries_of,
     hundredths,
     sum_with_compass,
@@ -41,7 +41,9 @@ _ORDER_TEXT: dict[Order, str] = {
 
 def verdict_text(verdict: Verdict) -> str:
     """Return the verdict and all its reasons as comments of YAML, a line each."""
-    reasons = (f"#   {r.severity}: {printable(str(r))}. {r.code.action}" for r in verdict.reasons)
+    reasons = (
+        f"#   {r.severity}: {sentence(printable(str(r)))} {r.code.action}" for r in verdict.reasons
+    )
     return "\n".join([f"# Verdict: {verdict.grade}", *reasons]) + "\n"
 
 
@@ -68,9 +70,9 @@ def instrument_text(calibration: Calibration | Solution) -> str:
         "# starboard axis (positive bow up), yaw about the downward axis (positive clockwise from",
         "# above). The DVL's axes are named as the body's are: if aligned, it has zero angles.",
         "",
-        f"# {TITLE}. {conventions(i)[0]}",
+        f"# {TITLE}. {definitions(i)[0]}",
         "# The DVL reads (1 + scale error) times the velocity.",
-        *(f"# {said}" for said in conventions(i)[2:]),
+        *(f"# {said}" for said in definitions(i)[1:]),
         "enter_in_dvl:",
         *(
             _line(
