@@ -59,7 +59,7 @@ _OTHER_AXES = (
 )
 _MAKERS_NUMBERS = (
     "instrument.yaml has the numbers as TRDI, Nortek, Water Linked and Exail define them. They "
-    "are here too if trial.yaml names the maker under `certificate`, `dvl`."
+    "are here too if trial.yaml has certificate: {dvl: {maker: …}}."
 )
 _NO_ROWS = "The maker's own numbers are not given: with them, the DVL would not look down."
 _MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water Linked": WATER_LINKED_AXES}
