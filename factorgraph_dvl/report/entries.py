@@ -123,7 +123,7 @@ def entries_of(i: InstrumentTerms) -> tuple[Entry, ...]:
     )
 
 
-def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
+def entries_table(i: InstrumentTerms, maker: str | None = None) -> Table:
     """Return the table of what to enter, for the terminal and for the page.
 
     Parameters
@@ -131,7 +131,8 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str, optional
-        Maker of the DVL; where it is known, the table has the maker's own names too.
+        Maker of the DVL, empty if a trial does not state it; where it is known, the table has the
+        maker's own names too. By default the numbers are not those of one trial.
     """
     table = Table(title=TITLE, caption=" ".join(conventions(i, maker)))
     table.column("quantity")
@@ -145,7 +146,7 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
             end_section=e is entries[-1],
         )  # fmt: skip
     graded = {e.key: e.grade for e in entries}
-    for name, text, unit, rule, of in maker_rows(i, maker):
+    for name, text, unit, rule, of in maker_rows(i, maker or ""):
         grade = worst(graded[key] for key in graded if key.startswith(tuple(of)))
         table.row(name, text, unit, rule, Mark(grade, GRADES[grade]))
     return table
@@ -160,7 +161,7 @@ def definitions(i: InstrumentTerms) -> tuple[str, ...]:
     )
 
 
-def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
+def conventions(i: InstrumentTerms, maker: str | None = None) -> tuple[str, ...]:
     """Return how the numbers are defined, which to enter, and what a maker's own depend on.
 
     Parameters
@@ -168,10 +169,12 @@ def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str, optional
-        Maker of the DVL.
+        Maker of the DVL, as for `entries_table`.
     """
-    known = _maker(maker)
     common = (*definitions(i), "Do not enter red or grey values.")
+    if maker is None:
+        return common
+    known = _maker(maker)
     if not known:
         return (*common, _MAKERS_NUMBERS)
     if not maker_rows(i, maker):
