@@ -102,26 +102,32 @@ def printed(solution, maker: str) -> dict[str, float]:
 
 
 @pytest.mark.parametrize(
-    ("maker", "axes", "mount", "configured"),
+    ("maker", "axes", "recorded", "mount", "configured"),
     [
-        ("Teledyne RDI Pathfinder", "RFU", TILTED, trdi),
-        ("Teledyne RDI Pathfinder", "RFU", TURNED, trdi),
-        ("Nortek DVL1000", "FRD", TILTED, nortek),
-        ("Nortek DVL1000", "FRD", TURNED, nortek),
+        ("Teledyne RDI Pathfinder", "RFU", "RFU", TILTED, trdi),
+        ("Teledyne RDI Pathfinder", "RFU", "RFU", TURNED, trdi),
+        ("Nortek DVL1000", "FRD", "FRD", TILTED, nortek),
+        ("Nortek DVL1000", "FRD", "FRD", TURNED, nortek),
         # Water Linked takes no tilt.
-        ("Water Linked A50", "FRD", LEVEL, water_linked),
-        ("Exail Delph INS", "FLU", TILTED, delph),
-        ("Exail Delph INS", "FLU", TURNED, delph),
+        ("Water Linked A50", "FRD", "FRD", LEVEL, water_linked),
+        ("Exail Delph INS", "FLU", "FLU", TILTED, delph),
+        ("Exail Delph INS", "FLU", "FLU", TURNED, delph),
+        # The DVL measures in its maker's axes, and the IMU in others.
+        ("Teledyne RDI Pathfinder", "FRD", "RFU", TILTED, trdi),
+        ("Nortek DVL1000", "RFU", "FRD", TILTED, nortek),
+        ("Water Linked A50", "FLU", "FRD", LEVEL, water_linked),
     ],
 )
 def test_a_dvl_configured_as_printed_has_no_misalignment_and_no_lever_arm(
-    maker, axes, mount, configured
+    maker, axes, recorded, mount, configured
 ):
     trial = simulate(scenario(body_axes=axes, dvl=mount | {"scale_error": 0.01}), 0)
-    solution = solve(trial)
+    to_recorded = AXES[axes] @ AXES[recorded].T
+    velocity = trial.dvl.velocity @ to_recorded
+    solution = solve(replace(trial, dvl=replace(trial.dvl, velocity=velocity)))
     typed = printed(solution, maker)
-    # What the DVL reports then, and what the INS makes of it.
-    velocity = configured(typed, trial.dvl.velocity) / (1.0 + 0.01 * typed["scale error"])
+    # What the DVL reports then, and what the INS makes of it, in axes of the body.
+    velocity = configured(typed, velocity) @ to_recorded.T / (1.0 + 0.01 * typed["scale error"])
     arm = np.cross(turn_rate(trial, trial.dvl.time), lever_arm(typed)) @ AXES[axes].T
     again = solve(replace(trial, dvl=replace(trial.dvl, velocity=velocity - arm)))
     limits = {
