@@ -29,10 +29,10 @@ REFUSED = {
 }
 # Makers by words in the name of a maker, and what must be checked before their names are used.
 _MAKERS = {
-    "TRDI": ("rdi", "teledyne"),
+    "TRDI": ("rdi", "rd instruments", "teledyne"),
     "Nortek": ("nortek",),
     "Water Linked": ("water linked", "waterlinked"),
-    "Delph": ("exail", "ixblue", "delph"),
+    "Delph": ("exail", "ixblue", "ixsea", "delph"),
 }
 _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
 _REMARKS = {
