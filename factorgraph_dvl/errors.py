@@ -41,7 +41,7 @@ class FactorgraphDvlError(Exception):
         if expected:
             text += f"; expected {self.expected}"
         if hint:
-            text += f". {self.hint}"
+            text += f" {self.hint}" if text.endswith("?") else f". {self.hint}"
         super().__init__(text)
 
 

@@ -9,8 +9,9 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body, wrapped
+from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.verdict import Grade, grades
@@ -52,6 +53,9 @@ class InstrumentTerms:
     ----------
     dvl_in_body, body_to_dvl : dict of Order to Angles
         Angles of C_d^b, the attitude of the DVL in the vehicle, and of C_b^d, by order.
+    as_frd : Angles
+        Angles of C_d^b, ZYX, for makers whose axes are forward, starboard, down: with the recorded
+        axes named as `axes_as` does it for them.
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
     scale_grade : tuple of Grade
@@ -64,9 +68,11 @@ class InstrumentTerms:
         Grades of the components of the lever arm.
     origin : str
         Where the lever arm starts: `IMU`, `INS` or `GNSS antenna`.
+    body_axes : BodyAxes
+        Names of the axes of the vehicle.
     alignment : ndarray, shape (3,)
-        TRDI's EA, EI, EJ, deg: with the axes of TRDI's instrument coordinates for d, C_b^d =
-        Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down.
+        TRDI's EA, EI, EJ, deg: C_b^d = Rz(-EA) Ry(EJ) Rx(EI) in forward, starboard, down, with
+        the recorded axes named as `axes_as` does it for TRDI.
     alignment_std : ndarray, shape (3,), deg
         Standard deviations of `alignment`.
     axes : ndarray, shape (3, 3)
@@ -76,6 +82,7 @@ class InstrumentTerms:
 
     dvl_in_body: dict[Order, Angles]
     body_to_dvl: dict[Order, Angles]
+    as_frd: Angles
     scale_error: Array
     scale_std: Array
     scale_grade: tuple[Grade, ...]
@@ -84,6 +91,7 @@ class InstrumentTerms:
     lever_arm_covariance: Array
     lever_arm_grade: tuple[Grade, ...]
     origin: str
+    body_axes: BodyAxes
     alignment: Array
     alignment_std: Array
     axes: Array
@@ -91,8 +99,45 @@ class InstrumentTerms:
     @property
     def attitude(self) -> Array:
         """C_d^b, the attitude of the DVL in the vehicle, (3, 3), in forward, starboard, down."""
-        angles = self.dvl_in_body["ZYX"].value[::-1]
-        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+        return attitude_of(self.axes, self.body_axes)
+
+    def axes_as(self, maker: BodyAxes) -> BodyAxes:
+        """Return the names of the recorded axes: a maker's if it then looks down, else the body's.
+
+        Parameters
+        ----------
+        maker : BodyAxes
+            Names of the axes in which an aligned DVL of this maker measures.
+        """
+        return axes_as(self.axes, maker, self.body_axes)
+
+    def attitude_as(self, maker: BodyAxes) -> Array:
+        """Return C_d^b, (3, 3), in forward, starboard, down, with axes named by `axes_as`."""
+        return attitude_of(self.axes, self.axes_as(maker))
+
+    @property
+    def rotation_offset(self) -> float:
+        """Water Linked's angle from the vehicle's forward axis to that of the DVL, deg, clockwise.
+
+        It is from 0 to 360.
+        """
+        return float(self.as_frd.value[2]) % 360.0
+
+
+# Axes of an aligned DVL that looks down, by maker.
+TRDI_AXES: BodyAxes = "RFU"
+NORTEK_AXES: BodyAxes = "FRD"
+WATER_LINKED_AXES: BodyAxes = "FRD"
+
+
+def attitude_of(axes: Array, named: BodyAxes) -> Array:
+    """Return C_d^b, (3, 3), in forward, starboard, down, of recorded axes with these names."""
+    return np.asarray((frd_from_body(named) @ axes).T)
+
+
+def axes_as(axes: Array, maker: BodyAxes, body: BodyAxes) -> BodyAxes:
+    """Return the names of recorded axes: a maker's if the DVL looks down so, or the body's."""
+    return maker if looks_down(attitude_of(axes, maker)) else body
 
 
 def has_instrument_terms(calibration: Calibration | Solution) -> bool:
@@ -127,8 +172,9 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     seen = next(e.observable for e in calibration.estimates if e.name == MISALIGNMENT)
     limit = calibration.limits.get(MISALIGNMENT, np.inf)
     frd = frd_from_body(calibration.body_axes)
-    # TRDI's instrument axes of a DVL that looks down, aligned: starboard, forward, up.
-    trdi = frd_from_body("RFU")
+    recorded = exp_so3(alpha * DEG) @ frd.T
+    trdi = frd_from_body(axes_as(recorded, TRDI_AXES, calibration.body_axes))
+    named = frd_from_body(axes_as(recorded, "FRD", calibration.body_axes))
 
     def angles(of: Callable[[Array], Array]) -> Angles:
         """Return angles that depend on the rotation vector, and their standard deviations."""
@@ -141,6 +187,9 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         # An angle is as observable as the component that adds most to its standard deviation.
         most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
         return Angles(value, std, grades(std, seen[most], limit))
+
+    def frd_angles(vector: Array) -> Array:
+        return euler((named @ exp_so3(vector * DEG) @ frd.T).T, "ZYX")
 
     def rpy(order: Order, *, inverse: bool) -> Angles:
         def of(vector: Array) -> Array:
@@ -161,6 +210,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     return InstrumentTerms(
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
+        as_frd=angles(frd_angles),
         scale_error=scale,
         scale_std=np.sqrt(np.diag(scale_covariance)),
         scale_grade=graded[SCALE_ERROR],
@@ -169,9 +219,10 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         lever_arm_covariance=lever_covariance,
         lever_arm_grade=tuple(graded[LEVER_ARM][i] for i in np.argmax(np.abs(frd), axis=1)),
         origin=_origin(calibration.inputs),
+        body_axes=calibration.body_axes,
         alignment=alignment.value,
         alignment_std=alignment.std,
-        axes=exp_so3(alpha * DEG) @ frd.T,
+        axes=recorded,
     )
 
 

@@ -18,6 +18,19 @@ _SIDES = (
 )
 # Angles that are written as 0, deg.
 _ALIGNED = 0.005
+# Tilt of a DVL, deg, from which on it does not look down. Chosen: halfway to the horizontal.
+_SIDEWAYS = 45.0
+
+
+def looks_down(attitude: Array) -> bool:
+    """Return whether a DVL looks down along its z axis.
+
+    Parameters
+    ----------
+    attitude : ndarray, shape (3, 3)
+        C_d^b in forward, starboard, down.
+    """
+    return bool(attitude[2, 2] > np.cos(_SIDEWAYS * DEG))
 
 
 def mount_in_words(axes: Array) -> list[str]:
@@ -32,7 +45,7 @@ def mount_in_words(axes: Array) -> list[str]:
     """
     axes = np.asarray(axes, float)
     down = axes[2, 2]
-    if abs(down) < np.cos(45.0 * DEG):
+    if abs(down) < np.cos(_SIDEWAYS * DEG):
         looks = f"The DVL is mounted sideways: its z axis points {direction(axes[2])}."
         return [looks, *(f"Its {_NAMES[k]} axis points {direction(axes[k])}." for k in (0, 1))]
     way = "down" if down > 0.0 else "up"

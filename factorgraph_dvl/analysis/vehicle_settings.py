@@ -15,12 +15,12 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.analysis.instrument_terms import (
     ANTENNA,
     ORIGINS,
+    WATER_LINKED_AXES,
     InstrumentTerms,
     instrument_of,
 )
-from factorgraph_dvl.analysis.mount import mount_in_words
+from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import ConfigError
-from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.notation import fixed
 from factorgraph_dvl.quality.verdict import Grade
@@ -38,8 +38,6 @@ _REFUSED = {
 _ROTATIONS = {0.0: 0, 90.0: 2, 180.0: 4, -90.0: 6}
 # Longest delay that ArduPilot takes, ms, and largest offset of a sensor, m.
 _LONGEST_DELAY, _FARTHEST = 250.0, 5.0
-# Tilt of a DVL, deg, from which on it does not look down. Chosen: halfway to the horizontal.
-_SIDEWAYS = 45.0
 _ELSEWHERE = "enter it in your navigation software"
 
 
@@ -118,10 +116,6 @@ def transform(i: InstrumentTerms) -> tuple[Array, Array]:
     return _FLU @ i.lever_arm, angles
 
 
-def _looks_down(i: InstrumentTerms) -> bool:
-    return bool(i.attitude[2, 2] > np.cos(_SIDEWAYS * DEG))
-
-
 def _turn(yaw: float, since: float) -> float:
     """Return the shorter turn from one angle to another, deg."""
     return (yaw - since + 180.0) % 360.0 - 180.0
@@ -182,7 +176,7 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     yield "ArduPilot. VISO_POS from the IMU of the autopilot, forward, right, down, m."
     yield from _viso_position(i)
-    if not _looks_down(i):
+    if not looks_down(i.attitude):
         yield f"VISO_ORIENT: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
         nearest = min(_ROTATIONS, key=lambda angle: abs(_turn(yaw, angle)))
@@ -219,22 +213,20 @@ def _viso_position(i: InstrumentTerms) -> Lines:
 
 
 def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
-    """Water Linked, DVL protocol: `mounting_rotation_offset`, whole degrees, clockwise.
+    """Water Linked, DVL protocol: `mounting_rotation_offset`, deg, clockwise.
 
     It is the direction of the DVL's forward axis seen from that of the vehicle.
     """
-    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
-    if not _looks_down(i):
+    roll, pitch, _ = (float(x) for x in i.as_frd.value)
+    if not looks_down(i.attitude_as(WATER_LINKED_AXES)):
         yield f"mounting_rotation_offset: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
-        offset = round(yaw) % 360
-        rest = _turn(yaw, offset)
-        parameters = {"mounting_rotation_offset": offset}
+        parameters = {"mounting_rotation_offset": round(i.rotation_offset, 2)}
         command = {"command": "set_config", "parameters": parameters}
         yield "Send this line to port 16171 of the DVL. Positive: clockwise from above."
         yield "It is valid if the offset was 0 in the trial."
+        yield "Software before 2.2.1 takes whole degrees."
         yield Setting(json.dumps(command), (i.dvl_in_body["ZYX"].grade[2],))
-        yield f"The rest of yaw, {fixed(rest, 2)} deg: {_ELSEWHERE}"
     yield from _not_set("Water Linked", i, f"roll {fixed(roll, 2)}, pitch {fixed(pitch, 2)} deg")
 
 

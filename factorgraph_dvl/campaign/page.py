@@ -36,6 +36,7 @@ from factorgraph_dvl.report.html.markup import (
     table,
 )
 from factorgraph_dvl.report.html.page import whole_page
+from factorgraph_dvl.report.html.sections import verdict_box
 
 # Of a panel, in pixels.
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 900, 190, 90, 20, 12, 24
@@ -60,6 +61,7 @@ def write_page(campaign: Campaign, out: Path) -> None:
     joint = campaign.joint
     if joint is not None:
         expected = for_the_next(campaign, joint)
+        sections.append(section("Verdict", verdict_box(expected.verdict), key="verdict"))
         if expected.verdict.grade != "do not use" and has_instrument_terms(expected):
             own = values_to_enter(instrument_of(expected))
             sections.append(section(TITLE, own, key="enter"))

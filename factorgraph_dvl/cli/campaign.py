@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from factorgraph_dvl.cli import events
 from factorgraph_dvl.cli.console import (
     CountLine,
     print_folder,
@@ -26,7 +27,7 @@ from factorgraph_dvl.cli.options import (
     Quiet,
     claim_output,
 )
-from factorgraph_dvl.cli.verdict import print_verdict
+from factorgraph_dvl.cli.verdict import print_entries, print_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -112,7 +113,7 @@ def _run_trials(
     scheduler: str | None,
     quiet: bool,
 ) -> None:
-    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, write_campaign
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, REPORT_FILE, write_campaign
     from factorgraph_dvl.campaign.page import write_page
     from factorgraph_dvl.campaign.trial_run import name_of, run_trial
     from factorgraph_dvl.campaign.trials import (
@@ -138,6 +139,8 @@ def _run_trials(
     _print_campaign(found)
     calibration = [] if found.joint is None else [CALIBRATION_FILE]
     print_folder(out, *calibration, CAMPAIGN_FILE)
+    if not events.active():
+        stdout().print(f"Open {out / REPORT_FILE}", markup=False, soft_wrap=True)
     _end(len(found.failed), len(runs))
 
 
@@ -241,7 +244,7 @@ def _print_campaign(found: Campaign) -> None:
         and expected.verdict.grade != "do not use"
         and has_instrument_terms(expected)
     ):
-        print_table(entries_table(instrument_of(expected)), "unit")
+        print_entries(entries_table(instrument_of(expected)))
 
 
 def _end(failed: int, count: int) -> None:

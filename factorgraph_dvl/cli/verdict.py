@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import typer
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from factorgraph_dvl.quality.verdict import Verdict
+    from factorgraph_dvl.report.table import Table
     from factorgraph_dvl.solution import Solution
 
 
@@ -30,7 +32,8 @@ def print_verdict(verdict: Verdict) -> None:
     stdout().print(verdict_line(verdict), soft_wrap=True)
 
 
-# Reasons of a verdict that are printed at the end. Chosen: they leave room for the values.
+# Reasons of a verdict that are printed at the end. Chosen: with the longest table, all that is
+# printed fits on a screen of 30 lines.
 _REASONS = 3
 
 
@@ -50,20 +53,24 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     from factorgraph_dvl.report.entries import entries_table, sum_with_compass
 
     print_verdict(solution.verdict)
-    reasons = solution.verdict.reasons[1:]
+    is_usable = solution.verdict.grade != "do not use" and has_instrument_terms(solution)
+    both = sum_with_compass(solution.findings) if is_usable else None
     if not events.active():
-        for reason in reasons[: _REASONS - 1]:
+        for reason in solution.verdict.reasons[1:_REASONS]:
             stdout().print(f"{reason.severity}: {reason}", markup=False, soft_wrap=True)
-        if len(reasons) >= _REASONS:
-            count = len(reasons) + 1 - _REASONS
-            stdout().print(f"Further reasons on the page: {count}", markup=False)
-    if solution.verdict.grade != "do not use" and has_instrument_terms(solution):
-        both = sum_with_compass(solution.findings)
-        if both is not None and not events.active():
+        if both is not None:
             stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)
-        print_table(entries_table(instrument_of(solution), maker), "unit")
+    if is_usable:
+        print_entries(entries_table(instrument_of(solution), maker))
     if not events.active():
         stdout().print(f"Open {page}", markup=False, soft_wrap=True)
+
+
+def print_entries(table: Table) -> None:
+    """Print the values to enter, then how they are defined, on one line however long it is."""
+    print_table(replace(table, caption=""))
+    if not events.active():
+        stdout().print(table.caption, markup=False, highlight=False, soft_wrap=True)
 
 
 def print_findings(solution: Solution) -> None:

@@ -72,13 +72,13 @@ class BoundObservation:
     chain : Chain
         What carries the motion.
     attachment : Attached
-        Where the measurements hang on it.
+        Where the measurements are attached to it.
     usable : ndarray of bool, shape (M,)
         Whether they may be used: the motion was known there when they were bound.
     weight : ndarray, shape (M, d)
         Inverse standard deviations; 0 = not used.
     clock_zero : float, s
-        When the offsets of clocks hold.
+        Reference time of the clock offsets.
     errors : ImuErrors, optional
         Errors of the IMU that are estimated.
     averages : bool, default False
@@ -139,7 +139,7 @@ class BoundObservation:
         return time_on_chain(self.observation, parameters, self.clock_zero, self.chain.clock)
 
     def attached(self, parameters: Mapping[str, Array]) -> Any:
-        """Return where measurements hang on the chain by clocks as they are."""
+        """Return where measurements are attached to the chain by clocks as they are."""
         shift = self.chain.shift(parameters)
         return self.chain.attach(
             self.times(parameters),
@@ -165,7 +165,7 @@ class BoundObservation:
         self.attachment = self.attached(parameters)
 
     def motion(self, at: Any, states: Any, parameters: Mapping[str, Array]) -> Motion:
-        """Return the motion where measurements hang on the chain."""
+        """Return the motion where measurements are attached to the chain."""
         return self.chain.motion(self._corrected(at, parameters), states)
 
     def _corrected(self, at: Any, parameters: Mapping[str, Array]) -> Any:
@@ -262,9 +262,10 @@ class BoundObservation:
         wanted : sequence of str
             Names of the parameters.
         processes : Processes
-            That it depends on.
+            Processes that the observation depends on.
         transitions : dict
-            To times of a motion, by its identity and which they are: kept for other observations.
+            Transitions to times of a motion, by its identity and which times they are. They are
+            kept for other observations.
         """
         lin, when = lin.some(some), self.observation.time[some]
         if motion.mean is not None:

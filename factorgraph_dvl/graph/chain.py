@@ -178,7 +178,7 @@ class Chain(Protocol):
         *,
         of_attitude: bool = False,
     ) -> Any:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest.
+        """Return where times (M,) are attached to the chain; the nearest place if not covered.
 
         Parameters
         ----------

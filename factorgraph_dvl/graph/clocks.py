@@ -32,7 +32,7 @@ def true_time(observation: Observation, values: Mapping[str, Array], zero: float
     values : mapping of str to ndarray
         Values of the parameters, SI.
     zero : float, s
-        Time at which the offsets of clocks hold.
+        Reference time of the clock offsets.
     """
     clock = observation.clock
     if clock is None:
@@ -52,7 +52,7 @@ def time_on_chain(
     values : mapping of str to ndarray
         Values of the parameters, SI.
     zero : float, s
-        Time at which the offsets of clocks hold.
+        Reference time of the clock offsets.
     clock : str, optional
         Name of the offset of the clock that the nodes have; None = they are at true times.
     """
@@ -89,7 +89,7 @@ def linearized(
     wanted : collection of str
         Parameters whose Jacobians are needed.
     zero : float, s
-        Time t0 at which the offsets of clocks hold.
+        Reference time t0 of the clock offsets.
     clock : str, optional
         Name of the offset of the clock that the nodes have; None = they are at true times.
     attitude_clock : str, optional

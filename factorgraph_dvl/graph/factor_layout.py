@@ -36,7 +36,7 @@ class Layout:
     rows : list of int
         Rows of each factor.
     parts : list of list of Part
-        By observation, where its rows go, some measurements at a time.
+        Where the rows of each observation go, some measurements at a time.
     """
 
     nodes: IntArray
@@ -50,9 +50,9 @@ def factor_layout(nodes: Sequence[IntArray], components: Sequence[int]) -> Layou
     Parameters
     ----------
     nodes : sequence of ndarray, shape (M, k)
-        By observation, the nodes that each of its M measurements depends on.
+        Nodes that each of the M measurements of an observation depends on.
     components : sequence of int
-        By observation, rows of a measurement.
+        Rows of a measurement of each observation.
     """
     every = np.concatenate(nodes)
     # One number for each set of nodes, which sorts as the set does.

@@ -1,4 +1,4 @@
-"""The chain of an IMU where measurements hang on the nodes before them alone.
+"""The chain of an IMU where measurements are attached to the nodes before them alone.
 
 The node after may be yet to come, or be no variable of a graph. What the noise of the IMU adds
 since the node is left out.
@@ -50,7 +50,7 @@ class ForwardChain(InertialChain):
         *,
         of_attitude: bool = False,
     ) -> Any:
-        """Return where times (M,) hang on the chain; beyond it, to first order from its edge."""
+        """Return where times (M,) are attached; beyond the chain, to first order from its edge."""
         rate = self.frame.earth_rate
         at, beyond = attach_smoothly(self.segments, time, rate)
         return later(at, beyond, rate) if beyond.any() else at
@@ -84,10 +84,10 @@ class ForwardChain(InertialChain):
 
 
 class ForwardErrors(ImuErrors):
-    """Errors of the IMU where measurements hang on the nodes before them alone."""
+    """Errors of the IMU where measurements are attached to the nodes before them alone."""
 
     def forward(self, at: Any) -> Attachment:
-        """Return where times hang on the nodes before."""
+        """Return where times are attached to the nodes before."""
         return at
 
     def without(self, at: Any, by: Sensitivity, errors: Array) -> Any:

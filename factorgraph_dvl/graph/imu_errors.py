@@ -105,7 +105,7 @@ class ImuErrors:
             self._by.update(zip(new, found, strict=True))
 
     def forward(self, at: Any) -> Attachment:
-        """Return where times hang on the nodes before."""
+        """Return where times are attached to the nodes before."""
         return at.forward
 
     @cached_property

@@ -249,7 +249,7 @@ class InertialChain:
         *,
         of_attitude: bool = False,
     ) -> TwoWay:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        """Return where times (M,) are attached to the chain; the nearest place if not covered."""
         return attach_two_way(self.segments, time, self.frame.earth_rate, window)
 
     def missing(self, at: TwoWay, lin: Linearization) -> Array | None:

@@ -1,4 +1,4 @@
-"""GTSAM's symbols, made here and nowhere else."""
+"""GTSAM's symbols: this is the only module that makes them."""
 
 from __future__ import annotations
 

@@ -164,7 +164,7 @@ def _parameters_at(
 
 
 def _add_prior(graph: gtsam.NonlinearFactorGraph, process: Process) -> None:
-    """Add what is known of a correlated error beforehand, which is linear."""
+    """Add the prior of a correlated error, which is linear."""
     gaussian, values = gtsam.GaussianFactorGraph(), gtsam.Values()
     process.add_prior(gaussian, process.zero)
     for j, node in enumerate(process.zero):

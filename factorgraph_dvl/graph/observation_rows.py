@@ -76,7 +76,7 @@ class ObservationRows:
 
     @property
     def correlated(self) -> ExpectedCorrelation | None:
-        """What is known beforehand of noise that persists."""
+        """The prior of noise that persists."""
         return self.whole.correlated
 
     @property

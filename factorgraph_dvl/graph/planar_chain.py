@@ -95,7 +95,7 @@ class PlanarStates:
 
 @dataclass(frozen=True)
 class Attached:
-    """Where M times hang on the chain.
+    """Where M times are attached to the chain.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ class PlanarChain:
         *,
         of_attitude: bool = False,
     ) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        """Return where times (M,) are attached to the chain; the nearest place if not covered."""
         time = np.clip(time, self.node_time[0], self.node_time[-1])
         node = np.searchsorted(self.node_time, time, side="right") - 1
         node = np.clip(node, 0, self.count - 1)

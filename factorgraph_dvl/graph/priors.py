@@ -111,7 +111,7 @@ class Tilt:
     sigma : ndarray, shape (P,), SI
         Standard deviations of the parameters.
     origin : dict of str to ndarray
-        Values of the parameters where it holds.
+        Values of the parameters that it is about.
     hold : ndarray, shape (P, P), 1/SI, optional
         Square root of the information that keeps a step short, about the origin.
     """
@@ -160,7 +160,7 @@ class Tilt:
     def factor(
         self, parameters: Sequence[Parameter], key_of: Mapping[str, int]
     ) -> gtsam.CustomFactor:
-        """Return a factor with this gradient, and with hardly any information but the hold.
+        """Return a factor with this gradient, and with hardly any information but that of `hold`.
 
         The error e has half the square c + g d, so that its slope is g wherever it is.
         """

@@ -1,6 +1,6 @@
 """A trial as a factor graph: native IMU factors, and sensors linearised in bulk.
 
-A measurement hangs on the nodes around it, through what was measured of the motion in between.
+A measurement depends on the nodes around it, through what was measured of the motion in between.
 Each sensor states its residual in terms of the motion at its time; the chain rule takes it to the
 nodes. A clock that is estimated moves its measurements along the chain at every evaluation. All
 measurements of a kind are evaluated in one NumPy pass and written into one Jacobian factor per
@@ -89,7 +89,7 @@ class Evaluation:
         The same as arrays: states as the chain has them, parameters by name, rotations as
         matrices.
     attached, motions, residuals : list of Attached, of Motion or of ndarray
-        Per observation: where it hangs on the chain; residuals whitened, (M, d).
+        Per observation: where it is attached to the chain; residuals whitened, (M, d).
     cost : float
         Half the sum of all squared whitened residuals.
     own_cost : float
@@ -164,11 +164,12 @@ class Problem:
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and parameters, in place of their own.
     clock_zero : float, optional
-        When the offsets of clocks hold, s; by default in the middle of the chain.
+        Reference time of the clock offsets, s; by default in the middle of the chain.
     processes : sequence of Process, optional
         Correlated errors of the observations, at most one each.
     usable : mapping of str to ndarray of bool, optional
-        By label, measurements (M,) that may be used where the chain covers them; by default all.
+        Measurements (M,) of each label that may be used where the chain covers them; by default
+        all.
     tilt : Tilt, optional
         Gradient of the objective by the parameters that no residual has.
 
@@ -179,14 +180,14 @@ class Problem:
     processes : tuple of Process
         They may be replaced by others at the same nodes.
     noise_factors : mapping of str to ndarray
-        By label, factors (d,) on the standard deviations that sensors state for their own noise;
-        1 where there are none. `weigh` applies them.
+        Factors (d,) of each label on the standard deviations that sensors state for their own
+        noise; 1 where there are none. `weigh` applies them.
     long_run : mapping of str to ndarray
-        By label, factors (d,) for noise that persists for some measurements; likewise.
+        Factors (d,) of each label for noise that persists for some measurements; likewise.
     gain : float
         Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
-        By label, weights from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
+        Weights of each label from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
 
     Examples
     --------
@@ -212,7 +213,7 @@ class Problem:
     ) -> None:
         self.chain = chain
         self.processes = tuple(processes)
-        # When the offsets of clocks hold, s.
+        # Reference time of the clock offsets, s.
         self.clock_zero = chain.middle if clock_zero is None else clock_zero
         self.all_parameters = tuple(parameters)
         self.parameters = tuple(p for p in parameters if p.estimated)
@@ -378,7 +379,7 @@ class Problem:
         )
 
     def _attached_at(self, parameters: dict[str, Array]) -> list[Any]:
-        """Return where observations hang on the chain.
+        """Return where observations are attached to the chain.
 
         Those at the same times have the same attachment, until a clock moves them.
         """
@@ -573,7 +574,7 @@ class Problem:
         return gaussian
 
     def _follow(self, evaluation: Evaluation) -> None:
-        """Take measurements to where they hang at an evaluation."""
+        """Attach measurements where their clocks are at an evaluation."""
         for block in self._blocks:
             for bound in block.bound:
                 at = evaluation.attached[self._bound.index(bound)]

@@ -68,7 +68,7 @@ class NodeMeasurements:
         return cls(tuple(bound), tuple(p for p in estimated if p.name in used), fixed)
 
     def attach(self, values: Mapping[str, Array]) -> list[Attachment]:
-        """Attach measurements by clocks as they are; those of one time share what they hang on.
+        """Attach measurements by clocks as they are; those of one time share what they depend on.
 
         Few times take as long as a single one: all at once.
         """
@@ -171,7 +171,7 @@ def bind(
     Parameters
     ----------
     chain : Chain
-        That covers the measurements.
+        Chain that covers the measurements.
     observations : sequence of Observation
         What was measured.
     parameters : sequence of Parameter
@@ -179,7 +179,7 @@ def bind(
     key_of : mapping of str to int
         Their keys.
     clock_zero : float
-        When the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
 
     Returns
     -------
@@ -208,7 +208,7 @@ class Linearized:
     values : mapping of str to ndarray
         Values of the parameters.
     residual, jacobian : ndarray
-        As `NodeMeasurements.linearize` returns them.
+        Residual and Jacobian that `NodeMeasurements.linearize` returns.
     """
 
     state: gtsam.NavState
@@ -324,7 +324,7 @@ def sensor_factor(
     values : gtsam.Values
         Approximate values of these variables. Standard deviations are taken there.
     clock_zero : float, optional
-        Time at which the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
 
     Raises
     ------
@@ -404,7 +404,7 @@ def measured_nodes(
     chain : Preintegration
         What the IMU saw between the nodes.
     clock_zero : float, optional
-        Time at which the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
 
     Examples
     --------

@@ -54,7 +54,7 @@ _CHUNK = 4096
 
 @dataclass(frozen=True)
 class Attached:
-    """Where M times hang on the chain.
+    """Where M times are attached to the chain.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class SmoothChain:
     """Nodes of a trial without IMU, and the prior of their motion.
 
     Position and velocity of a node are at its time by one clock, attitude and rate at another by
-    the clock of attitudes: a measurement hangs between the nodes that each of both is between, and
+    the clock of attitudes: a measurement is attached to the nodes on both sides by each clock, and
     may pass nodes of either as clocks move.
 
     Parameters
@@ -188,7 +188,7 @@ class SmoothChain:
     def joints(self) -> list[int]:
         """Nodes between which branches lie: eliminated last, they leave each by itself.
 
-        Two at a time: a measurement may hang on the track after a node, and on attitudes before.
+        Two at a time: a measurement may depend on the track after a node, and on attitudes before.
         """
         first = range(_BRANCH, self.node_time.size - 1, _BRANCH)
         return [k + i for k in first for i in (0, 1)]
@@ -304,7 +304,7 @@ class SmoothChain:
         *,
         of_attitude: bool = False,
     ) -> Attached:
-        """Return where times (M,) hang on the chain; those that are not covered, where nearest."""
+        """Return where times (M,) are attached to the chain; the nearest place if not covered."""
         turned = place_of(time + shift, self.attitude_time)
         if not of_attitude:
             return Attached(place_of(time, self.node_time), turned)

@@ -287,7 +287,7 @@ class Between:
         Parameters
         ----------
         density : ndarray, shape (K - 1, 6)
-            As of `motion_steps`.
+            Densities, as for `motion_steps`.
         nRt : ndarray, shape (K, 3, 3)
             Axes of the track.
 

@@ -166,7 +166,7 @@ def trajectory_at(
     epochs : Epochs
         When the motion is wanted.
     states, P, gravity_n, frame, body_axes : optional
-        As of `trajectory_between`.
+        The same as for `trajectory_between`.
     """
     motion = motion_at(epochs.at, states, gravity_n, frame.earth_rate)
     count, size = epochs.time.size, epochs.duration.size

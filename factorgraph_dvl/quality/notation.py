@@ -27,6 +27,11 @@ def in_words(name: str) -> str:
     return " ".join(_ACRONYMS.get(word, word) for word in name.split("_"))
 
 
+def sentence(text: str) -> str:
+    """Return a text with a full stop, unless it ends with a mark of its own."""
+    return text if text.endswith((".", "?", "!")) else f"{text}."
+
+
 def fixed(value: float, decimals: int, *, signed: bool = False) -> str:
     """Write a number with so many decimals, never as a negative zero."""
     return format(round(value, decimals) + 0.0, f"{'+' if signed else ''}.{decimals}f")

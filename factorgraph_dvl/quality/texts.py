@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
@@ -13,6 +14,8 @@ from factorgraph_dvl.message import Message, Value, plain
 from factorgraph_dvl.quality.notation import in_words, split_unit
 
 Language = Literal["en", "zh"]
+# What follows the name of a parameter of several components.
+_AXIS = re.compile(r"\d*[xyz]|\d+")
 # Beginnings of causes that name a measurement or a parameter, and what follows it in Chinese.
 _CAUSES = {
     "noise of ": "噪声",
@@ -117,9 +120,14 @@ def decoded(data: Any, text: str) -> Message | str:
 
 
 def chinese(english: str) -> str:
-    """Return a phrase, or the name of a parameter, in Chinese; where there is none, as it is."""
-    name = catalogue("parameters").get(english.lower().replace(" ", "_"), english)
-    return str(catalogue("phrases").get(english, name))
+    """Return a phrase, or the name of a parameter, in Chinese; where there is none, as it is.
+
+    The name of a component is that of its parameter, and its axis.
+    """
+    names, name = catalogue("parameters"), english.lower().replace(" ", "_")
+    stem, _, axis = name.rpartition("_")
+    own = f"{names[stem]} {axis}" if stem in names and _AXIS.fullmatch(axis) else english
+    return str(catalogue("phrases").get(english, names.get(name, own)))
 
 
 def chinese_cause(cause: str) -> str:

@@ -127,7 +127,7 @@ class PendingMeasurements:
         values : mapping of str to ndarray
             Values of the parameters, SI.
         clock_zero : float
-            When the offsets of clocks hold, s.
+            Reference time of the clock offsets, s.
 
         Returns
         -------

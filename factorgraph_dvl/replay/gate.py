@@ -204,7 +204,7 @@ class Judged:
     innovations : tuple of Innovations
         Innovations of each kind.
     rejected : dict of str to ndarray
-        By label, times (K,) of the measurements that are not to be used, s.
+        Times (K,), s, of the measurements of each label that are not to be used.
     findings : tuple of Finding
         What the gate noticed.
     """

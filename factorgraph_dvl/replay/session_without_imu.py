@@ -76,7 +76,7 @@ class ReplayWithoutImu:
     Parameters
     ----------
     trial : Trial
-        Without IMU.
+        Trial without IMU.
     lag_s : float
         Age beyond which states are no longer corrected, s.
     progress : callable

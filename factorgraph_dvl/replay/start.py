@@ -72,7 +72,8 @@ class ReplayStart:
     spurious : ndarray, shape (P, P)
         Spurious information on the parameters, in units of the priors' standard deviations.
     noise_factors : mapping of str to ndarray
-        By label, factors (d,) on the standard deviations that sensors state for their own noise.
+        Factors (d,) of each label on the standard deviations that sensors state for their own
+        noise.
     noise : tuple of Noise
         Noise as it is reported.
     errors : CorrelatedErrors
@@ -80,7 +81,7 @@ class ReplayStart:
     noise_known : bool
         Whether the records are long enough to show what persists of the noise.
     clock_zero : float
-        When the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
     trajectory : Trajectory
         Motion after the time that `solve_start` was given.
     findings : tuple of Finding
@@ -156,7 +157,7 @@ def solve_start(
     progress : callable
         Called with stage, iteration and cost.
     clock_zero : float
-        When the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
 
     Returns
     -------

@@ -72,9 +72,9 @@ class BatchSolution:
     parameters : tuple of Parameter
         All of them, those that are not estimated included.
     clock_zero : float, s
-        When the offsets of clocks hold.
+        Reference time of the clock offsets.
     noise_factors, long_run : mapping of str to ndarray
-        As of the problem.
+        Factors of the problem.
     noise : tuple of Noise
         The same, as it is reported.
     late : float, s
@@ -87,7 +87,7 @@ class BatchSolution:
     tilt : ndarray, shape (P,), 1/s
         Gradient of the states' volume that every second adds.
     std : dict of str to ndarray
-        By label, standard deviations (d,) of noise that sensors take from the whole record.
+        Standard deviations (d,) of each label, of noise that sensors take from the whole record.
     labels : dict of str to set of str
         Labels of the measurements of each sensor, by its section.
     """
@@ -271,7 +271,7 @@ class Past:
     nodes : mapping of str to ndarray
         Their nodes (J, size) that stay, by name.
     measured : mapping of str to float
-        By label, the time, s, of the last measurement that leaves.
+        Time, s, of the last measurement of each label that leaves.
     """
 
     known: Known

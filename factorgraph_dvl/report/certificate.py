@@ -20,8 +20,9 @@ def statements(result: Result) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yield what is stated: the words that name it, and its text."""
     solution = result.solution
     yield from _stated(result.certificate)
-    if "date" not in result.certificate and result.run.get("epoch"):
-        yield ("recorded from",), str(result.run["epoch"])
+    if "date" not in result.certificate:
+        epoch = result.run.get("epoch")
+        yield (("recorded from",), str(epoch)) if epoch else (("date",), "not stated")
     yield ("trial",), result.trial
     method = "Factor graph of all data" if solution.solver == "batch" else solution.solver
     yield ("method",), method

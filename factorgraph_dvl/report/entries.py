@@ -7,9 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms
+from factorgraph_dvl.analysis.instrument_terms import (
+    NORTEK_AXES,
+    TRDI_AXES,
+    WATER_LINKED_AXES,
+    InstrumentTerms,
+)
+from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.notation import at_precision, fixed, with_std
+from factorgraph_dvl.quality.notation import at_precision, with_std
 from factorgraph_dvl.quality.verdict import Grade
 from factorgraph_dvl.report.table import Mark, Table
 from factorgraph_dvl.report.tables import GRADES
@@ -21,17 +27,42 @@ REFUSED = {
     "red": "σ is more than twice its limit",
     "grey": "the trial did not determine it",
 }
-# What must be checked before the names of a maker are used, by the first word of them.
-_AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
-_UNVERIFIED = "The maker's signs are not verified against its manual: check one before use."
-_REMARKS = {
-    "TRDI": (_AT_ZERO, "The sign of EA is not verified against a manual: check it before use."),
-    "Nortek": (_UNVERIFIED,),
-    "Water": (_AT_ZERO,),
-    "Delph": (_UNVERIFIED,),
+# Makers by words in the name of a maker, and what must be checked before their names are used.
+_MAKERS = {
+    "TRDI": ("rdi", "rd instruments", "teledyne"),
+    "Nortek": ("nortek",),
+    "Water Linked": ("water linked", "waterlinked"),
+    "Delph": ("exail", "ixblue", "ixsea", "delph"),
 }
-# Chosen: a DVL that looks down has a smaller roll and pitch.
-_LOOKS_UP_DEG = 90.0
+_AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
+_REMARKS = {
+    "TRDI": (_AT_ZERO,),
+    "Nortek": (
+        "The sign of yaw is the maker's. Those of roll and pitch are assumed: check one before "
+        "use.",
+    ),
+    "Water Linked": (_AT_ZERO,),
+    "Delph": (
+        "The signs of the lever arm are the maker's. Those of the angles are assumed: check one "
+        "before use.",
+    ),
+}
+# How a maker's numbers name the axes x, y, z of the record.
+RECORDED_AXES = {
+    "RFU": "The axes x, y, z of the record are taken as starboard, forward, up of the DVL.",
+    "FRD": "The axes x, y, z of the record are taken as forward, starboard, down of the DVL.",
+    "FLU": "The axes x, y, z of the record are taken as forward, port, up of the DVL.",
+}
+_OTHER_AXES = (
+    "With its axes named as those of the body, the DVL would not look down: the angles contain "
+    "the turn between the axes of the two instruments."
+)
+_MAKERS_NUMBERS = (
+    "instrument.yaml has the numbers as TRDI, Nortek, Water Linked and Exail define them. They "
+    "are here too if trial.yaml has certificate: {dvl: {maker: …}}."
+)
+_NO_ROWS = "The maker's own numbers are not given: with them, the DVL would not look down."
+_MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water Linked": WATER_LINKED_AXES}
 
 
 @dataclass(frozen=True)
@@ -92,7 +123,7 @@ def entries_of(i: InstrumentTerms) -> tuple[Entry, ...]:
     )
 
 
-def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
+def entries_table(i: InstrumentTerms, maker: str | None = None) -> Table:
     """Return the table of what to enter, for the terminal and for the page.
 
     Parameters
@@ -100,7 +131,8 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str, optional
-        Maker of the DVL; where it is known, the table has the maker's own names too.
+        Maker of the DVL, empty if a trial does not state it; where it is known, the table has the
+        maker's own names too. By default the numbers are not those of one trial.
     """
     table = Table(title=TITLE, caption=" ".join(conventions(i, maker)))
     table.column("quantity")
@@ -114,32 +146,41 @@ def entries_table(i: InstrumentTerms, maker: str = "") -> Table:
             end_section=e is entries[-1],
         )  # fmt: skip
     graded = {e.key: e.grade for e in entries}
-    for name, text, unit, rule, of in maker_rows(i, maker):
+    for name, text, unit, rule, of in maker_rows(i, maker or ""):
         grade = worst(graded[key] for key in graded if key.startswith(tuple(of)))
         table.row(name, text, unit, rule, Mark(grade, GRADES[grade]))
     return table
 
 
-def conventions(i: InstrumentTerms, maker: str = "") -> tuple[str, ...]:
-    """Return how angles and lever arm are defined, and which values must not be entered.
+def definitions(i: InstrumentTerms) -> tuple[str, ...]:
+    """Return how the angles and the lever arm are defined."""
+    return (
+        "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
+        f"Lever arm: from the {i.origin} to the DVL.",
+        *([] if looks_down(i.attitude) else [_OTHER_AXES]),
+    )
+
+
+def conventions(i: InstrumentTerms, maker: str | None = None) -> tuple[str, ...]:
+    """Return how the numbers are defined, which to enter, and what a maker's own depend on.
 
     Parameters
     ----------
     i : InstrumentTerms
         Calibration in the terms of instruments.
     maker : str, optional
-        Maker of the DVL: what must be checked before its own names are used comes last.
+        Maker of the DVL, as for `entries_table`.
     """
-    return (
-        "Attitude of the DVL in the vehicle, ZYX: yaw first, then pitch, then roll.",
-        "Do not enter red or grey values.",
-        f"Lever arm: from the {i.origin} to the DVL.",
-        *dict.fromkeys(
-            remark
-            for name, *_ in maker_rows(i, maker)
-            for remark in _REMARKS.get(name.split()[0], ())
-        ),
-    )
+    common = (*definitions(i), "Do not enter red or grey values.")
+    if maker is None:
+        return common
+    known = _maker(maker)
+    if not known:
+        return (*common, _MAKERS_NUMBERS)
+    if not maker_rows(i, maker):
+        return (*common, _NO_ROWS)
+    named = [RECORDED_AXES[i.axes_as(_MAKER_AXES[known])]] if known in _MAKER_AXES else []
+    return (*common, *named, *_REMARKS[known])
 
 
 def sum_with_compass(findings: Iterable[Finding]) -> Finding | None:
@@ -162,45 +203,50 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
     maker : str
         Maker as a certificate names it; there are no rows for a maker that is not known.
     """
-    roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     angles = ("roll", "pitch", "yaw")
-    clockwise = "clockwise from above"
-    known = maker.lower()
-    if any(name in known for name in ("trdi", "rdi", "teledyne")) and not looks_up_for_trdi(i):
-        rules = (clockwise, "ship: port side up", "ship: bow up")
+    known = _maker(maker)
+    if known == "TRDI" and looks_down(i.attitude_as(TRDI_AXES)):
+        signs = ("to starboard", "ship: port up", "ship: bow up")
+        stds = 100.0 * i.alignment_std
         return [
-            (f"TRDI {name}", f"{hundredths(float(a))}", "0.01 deg", rule, angles)
-            for name, a, rule in zip(("EA", "EI", "EJ"), i.alignment, rules, strict=True)
+            (f"TRDI {name}", f"{hundredths(a)} ± {at_precision(s, s)}", "0.01 deg", rule, angles)
+            for name, a, s, rule in zip(("EA", "EI", "EJ"), i.alignment, stds, signs, strict=True)
         ]
-    if "nortek" in known:
+    if known == "Nortek":
         rules = ("starboard down", "bow up", "to starboard")
         return [
-            (f"Nortek {name}", fixed(a, 2), "deg", rule, angles)
-            for name, a, rule in zip(angles, (roll, pitch, yaw), rules, strict=True)
+            (f"Nortek {name}", with_std(a, std), "deg", rule, angles)
+            for name, a, std, rule in zip(angles, i.as_frd.value, i.as_frd.std, rules, strict=True)
         ]
-    if any(name in known for name in ("water linked", "waterlinked")) and not looks_up(i):
-        offset = f"{round(yaw) % 360}"
-        return [("Water Linked mounting_rotation_offset", offset, "deg", clockwise, ("yaw",))]
-    if any(name in known for name in ("exail", "ixblue", "delph")):
-        forward, starboard, down = (float(x) for x in i.lever_arm)
-        arm = (("X1", forward, "ahead"), ("X2", -starboard, "to port"), ("X3", -down, "above"))
+    if known == "Water Linked" and looks_down(i.attitude_as(WATER_LINKED_AXES)):
+        offset = with_std(i.rotation_offset, i.as_frd.std[2])
+        return [("Water Linked mounting rotation offset", offset, "deg", "to starboard", ("yaw",))]
+    if known == "Delph":
+        turned, arm = i.dvl_in_body["ZYX"], i.lever_arm
+        heading, pitch, roll = turned.value[::-1]
         return [
-            ("Delph heading", fixed(yaw, 2), "deg", clockwise, angles),
-            ("Delph pitch", fixed(-pitch, 2), "deg", "bow down", angles),
-            ("Delph roll", fixed(roll, 2), "deg", "port side up", angles),
-            *((f"Delph {name}", fixed(x, 3), "m", rule, ("lever_arm",)) for name, x, rule in arm),
-        ]
+            *(
+                (f"Delph {name}", with_std(x, std), "deg", rule, angles)
+                for name, x, std, rule in zip(
+                    ("heading", "pitch", "roll"), (heading, -pitch, roll), turned.std[::-1],
+                    ("to starboard", "bow down", "port side up"), strict=True,
+                )
+            ),
+            *(
+                (f"Delph XV{k}", with_std(x, std), "m", rule, ("lever_arm",))
+                for k, x, std, rule in zip(
+                    (1, 2, 3), (arm[0], -arm[1], -arm[2]), i.lever_arm_std,
+                    ("ahead", "to port", "above"), strict=True,
+                )
+            ),
+        ]  # fmt: skip
     return []
 
 
-def looks_up(i: InstrumentTerms) -> bool:
-    """Return whether the DVL looks up as it is mounted."""
-    return bool(np.max(np.abs(i.dvl_in_body["ZYX"].value[:2])) > _LOOKS_UP_DEG)
-
-
-def looks_up_for_trdi(i: InstrumentTerms) -> bool:
-    """Return whether TRDI's commands would make the DVL look up."""
-    return bool(np.max(np.abs(i.alignment[1:])) > _LOOKS_UP_DEG)
+def _maker(name: str) -> str:
+    """Return the maker that a name means, as rows name it; empty if it is not known."""
+    named = name.lower()
+    return next((m for m, words in _MAKERS.items() if any(w in named for w in words)), "")
 
 
 def hundredths(angle: float) -> int:

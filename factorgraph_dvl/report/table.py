@@ -82,8 +82,10 @@ class Table:
             tuple(named_with_unit(cell) if isinstance(cell, Component) else cell for cell in row)
             for row in self.rows
         ]
-        details = (column.header for column in self.columns if column.detail)
-        return replace(self, rows=rows).without("unit", *details)
+        details = [column.header for column in self.columns if column.detail]
+        named = any(isinstance(cell, Component) for row in self.rows for cell in row)
+        units = ["unit"] if named else []
+        return replace(self, rows=rows).without(*units, *details)
 
 
 def named_with_unit(component: Component) -> str:

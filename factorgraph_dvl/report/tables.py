@@ -18,7 +18,7 @@ from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.plausibility.survey import Survey
 from factorgraph_dvl.quality.finding import Finding
-from factorgraph_dvl.quality.notation import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.quality.notation import at_precision, fixed, sentence, split_unit, with_std
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.report.table import Cell, Component, Mark, Table, unit_of
 from factorgraph_dvl.sensors.imu import ImuSettings
@@ -118,7 +118,7 @@ def verdict_line(verdict: Verdict) -> Text:
     line = Text.assemble("Verdict: ", (verdict.grade, VERDICT_COLOURS[verdict.grade]))
     if verdict.reasons:
         first, *others = verdict.reasons
-        line.append(f": {printable(str(first))}. {first.code.action}")
+        line.append(f": {sentence(printable(str(first)))} {first.code.action}")
         if others:
             line.append(f" (Further reasons: {len(others)}.)")
     return line

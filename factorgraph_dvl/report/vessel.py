@@ -76,10 +76,60 @@ def places_of(
 
 
 def seen(view: Array, places: Sequence[Place]) -> tuple[Array, Array, float]:
-    """Return where places are seen in a view (2, 3): points (n, 2), their middle and span, m."""
-    points = np.stack([view @ p.place for p in places])
-    low, high = points.min(axis=0), points.max(axis=0)
-    return points, 0.5 * (low + high), max(float((high - low).max()), _LEAST_M)
+    """Return where places are seen in a view (2, 3): points (n, 2), their middle and span, m.
+
+    The span is the largest of all views, so that they have one scale.
+    """
+    where = np.stack([p.place for p in places])
+    points = where @ view.T
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    span = max(float(np.ptp(where @ v.T, axis=0).max()) for v in VIEWS.values())
+    return points, middle, max(span, _LEAST_M)
+
+
+def label_places(
+    at: Array, sides: Array, widths: Sequence[float], height: float
+) -> Iterator[tuple[bool, bool, float]]:
+    """Yield where the names of points are: to the right or left, below or above, and how far, px.
+
+    Each has the first place, beginning on its own side, without another name or point.
+
+    Parameters
+    ----------
+    at : ndarray, shape (n, 2), px
+        Points, to the right and downward.
+    sides : ndarray, shape (n, 2)
+        Directions to the side of each point on which its name begins to look for room.
+    widths : sequence of float, px
+        Widths of the names.
+    height : float, px
+        Height of a name.
+    """
+    taken = [np.array([*(xy - 0.3 * height), *(xy + 0.3 * height)]) for xy in at]
+    for xy, side, width in zip(at, sides, widths, strict=True):
+        right, below = map(bool, side >= 0.0)
+        tried = [
+            (is_right, is_below, (0.5 + line) * height)
+            for line in range(len(at))
+            for is_below in (below, not below)
+            for is_right in (right, not right)
+        ]
+        boxes = [_box(xy, width, height, place) for place in tried]
+        first = next((k for k, box in enumerate(boxes) if not _overlaps(box, taken)), 0)
+        taken.append(boxes[first])
+        yield tried[first]
+
+
+def _box(xy: Array, width: float, height: float, place: tuple[bool, bool, float]) -> Array:
+    """Return left, top, right, bottom of a name at one of its places."""
+    right, below, far = place
+    x = xy[0] + (0.5 * height if right else -0.5 * height - width)
+    y = xy[1] + (far if below else -far - height)
+    return np.array([x, y, x + width, y + height])
+
+
+def _overlaps(box: Array, others: Sequence[Array]) -> bool:
+    return any((box[:2] < o[2:]).all() and (o[:2] < box[2:]).all() for o in others)
 
 
 def ellipse(covariance: Array) -> tuple[float, float, float] | None:

@@ -261,9 +261,13 @@ def _explain(message: str, root: yaml.Node, value: Any, kind: Any, source: str) 
     expected = _expected(reason, _descend(kind, path))
     name = next((key for key in reversed(path) if isinstance(key, str)), "")
     limits = range_of(name)
-    if isinstance(found, str) and expected.startswith("a number") and limits and limits.unit:
+    if isinstance(found, str) and expected.startswith(("a number", "a list")) and limits:
         given = _WITH_UNIT.fullmatch(found.strip())
-        expected = expected.replace("a number", f"a number in {limits.unit}", 1)
+        of = f" in {limits.unit}" if limits.unit else ""
+        if expected.startswith("a number"):
+            expected = expected.replace("a number", f"a number{of}", 1)
+        elif of:
+            expected = expected.replace("a list", f"a list of numbers{of}", 1)
         if given:
             factor = _FACTORS.get((given["unit"], limits.unit))
             value = "" if factor is None else f": {float(given['number']) * factor:g}"
@@ -280,6 +284,7 @@ _FACTORS = {
     **{("mm/s", "m/s"): 1e-3, ("cm/s", "m/s"): 1e-2, ("kn", "m/s"): 1852.0 / 3600.0},
     **{("m/s", "m/s"): 1.0, ("ms", "s"): 1e-3, ("us", "s"): 1e-6, ("s", "s"): 1.0},
     **{("°", "deg"): 1.0, ("deg", "deg"): 1.0, ("rad", "deg"): 180.0 / math.pi},
+    ("%", ""): 1e-2,
     **{("mg", "µg"): 1e3, ("µg", "µg"): 1.0, ("ug", "µg"): 1.0},
 }
 

@@ -43,7 +43,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     Parameters
     ----------
     problem, minimum : Problem or Minimum
-        At its minimum.
+        Problem, and its minimum.
     """
     known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.plausible}
     out = []

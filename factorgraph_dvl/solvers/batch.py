@@ -241,7 +241,7 @@ def settled_minimum(
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and calibration, in place of the trial's priors.
     clock_zero : float, optional
-        When the offsets of clocks hold, s; by default in the middle of the trial.
+        Reference time of the clock offsets, s; by default in the middle of the trial.
     """
     report = progress or _silent
     _check_above_zero("state_interval_s", state_interval_s)

@@ -90,7 +90,7 @@ def bias_walks(
     minimum : Minimum
         Where it ended.
     noise : mapping of str to ndarray
-        By label, factors (d,) on the noise of sensors: 1 where it is as stated.
+        Factors (d,) of each label on the noise of sensors: 1 where it is as stated.
     report : callable
         Called with stage, iteration and cost.
     """

@@ -34,7 +34,7 @@ class ComponentChange:
     name : str
         Name of the component.
     parameter : Parameter
-        That it belongs to.
+        Parameter of the component.
     change : Change
         Its test, in reported units.
     """

@@ -51,9 +51,9 @@ class CorrelatedNoise:
     processes : tuple of Process
         Errors that persist for longer than the interval of the states.
     factors : mapping of str to ndarray
-        By label, factors (d,) on the standard deviations of the white noise that is left.
+        Factors (d,) of each label on the standard deviations of the white noise that is left.
     long_run : mapping of str to ndarray
-        By label, factors (d,) on standard deviations for noise that persists for seconds.
+        Factors (d,) of each label on standard deviations for noise that persists for seconds.
     gain : float
         Fall of -2 log likelihood by what is not stated, against white noise alone.
     long_run_gain : float

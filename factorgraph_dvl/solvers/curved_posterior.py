@@ -2,7 +2,7 @@
 
 While the current is hardly known, ranges to one beacon leave an arc around it. The covariance
 at the most probable track is a straight, thin ellipse, which misses the ends of that arc. So the
-first position is held at points of a grid along the arc, and the rest of the same problem is
+first position is fixed at points of a grid along the arc, and the rest of the same problem is
 minimised anew at each: an integrated nested Laplace approximation (Rue, Martino and Chopin, J.
 Royal Statistical Society B 71(2), 2009) in one direction.
 """
@@ -90,7 +90,7 @@ def _is_curved(P: Array, distances: Array) -> bool:
 
 
 def _held(problem: Problem, place: Array, along: Array, sigma: float) -> Problem:
-    """Return the problem with the first position held at a place, in one direction."""
+    """Return the problem with the first position fixed at a place, in one direction."""
     out = copy(problem)
     out.graph = gtsam.NonlinearFactorGraph(problem.graph)
     row = np.concatenate([along, np.zeros(2)])[None] / sigma

@@ -31,7 +31,7 @@ def causes(
     found : SolvedProblem
         Problem at its minimum, with covariances.
     use : callable, optional
-        As of `error_budget`; not called where nothing is estimated.
+        The same as for `error_budget`; not called where nothing is estimated.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
     rows = reported(problem, evaluation)

@@ -100,10 +100,10 @@ def minimise(
     Starts as Gauss-Newton; a step that does not lower the cost brings in Levenberg's
     damping. Damping from the start, in proportion to the diagonal of the information
     matrix, would stall: the diagonal is that of relative attitudes known to 1e-7 rad, and
-    holds back the common rotation of the whole trajectory as well.
+    damps the common rotation of the whole trajectory as well.
 
     Steps come from Cholesky's factorisation, which is fast but squares the condition of the
-    problem. When one fails, and before a minimum is believed, QR takes over.
+    problem. When one fails, and before a minimum is accepted, QR takes over.
 
     Parameters
     ----------
@@ -261,9 +261,9 @@ def _tried(
     delta : gtsam.VectorValues
         Step of the linear model.
     promised : float
-        By how much it says that the cost falls.
+        Predicted fall of the cost.
     past : sequence of tuple of gtsam.Values and gtsam.VectorValues
-        As of `_extrapolated`; that of one step says nothing.
+        Past steps, as for `_extrapolated`, which needs more than one.
     """
     trial = problem.evaluate(evaluation.values.retract(delta))
     if len(past) > 1 and problem.parameters:

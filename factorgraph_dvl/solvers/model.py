@@ -53,21 +53,21 @@ class Model:
     processes, stated_processes : tuple of Process
         Correlated errors, and those that the trial states.
     noise_factors : mapping of str to ndarray
-        By label, factors (d,) on stated standard deviations.
+        Factors (d,) of each label on stated standard deviations.
     long_run : mapping of str to ndarray
-        By label, factors (d,) for noise that persists for some measurements.
+        Factors (d,) of each label for noise that persists for some measurements.
     gain : float, default 0
         Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
-        By label, 0 where a measurement is a gross error.
+        Weights of each label: 0 where a measurement is a gross error.
     rejected : mapping of str to ndarray
-        By label, times of measurements beyond the gate of their sensor.
+        Times of the measurements of each label beyond the gate of their sensor.
     tilt : Tilt, optional
         Gradient of the objective by the parameters that no residual has.
     constants_prior : ConstantsPrior, optional
         Joint prior of biases and parameters, in place of their own.
     clock_zero : float, optional
-        When the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
     """
 
     prepared: Prepared

@@ -61,7 +61,7 @@ class Strengths:
     chain : SmoothChain
         Chain with densities.
     factors : dict of str to ndarray
-        By label, factors (d,) on stated white noise.
+        Factors (d,) of each label on stated white noise.
     processes : tuple of Process
         Processes with their deviations.
     tilt : Tilt
@@ -220,8 +220,8 @@ def _next_tilt(
 ) -> tuple[Tilt, Array]:
     """Return the tilt at some values, and the step of the parameters that it asks for, in σ.
 
-    The gradient holds near by: where it alone moves the parameters by more than `_TRUSTED`, they
-    are held back.
+    The gradient is valid near by. Where it alone moves the parameters by more than `_TRUSTED`,
+    they are damped.
 
     Parameters
     ----------

@@ -82,8 +82,8 @@ def predict_posterior(
     true_states : TrueStates
         Returns the motion at (K,) times in a frame.
     white : mapping of str to ndarray, optional
-        By label of an observation, standard deviations (d,) of its white noise, SI, where a solver
-        finds them in the record; NaN where they are as stated.
+        Standard deviations (d,), SI, of the white noise of each label, where a solver finds
+        them in the record; NaN where they are as stated.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def continue_posterior(
     Parameters
     ----------
     trial, true_states : Trial or TrueStates
-        As of `predict_posterior`, with an IMU; its priors are not used.
+        The same as for `predict_posterior`. The trial has an IMU; its priors are not used.
     start : Frontier
         Frontier at the first node.
     """

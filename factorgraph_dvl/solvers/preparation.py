@@ -255,7 +255,7 @@ class MountedStart:
     robust_weights : dict of str to ndarray
         Weights of measurements that are gross errors there, 0 or 1, by label.
     iterations : int
-        That it took.
+        Iterations that it took.
     """
 
     states: Any

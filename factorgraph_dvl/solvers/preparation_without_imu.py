@@ -107,11 +107,11 @@ class PreparationWithoutImu:
     findings : tuple of Finding
         What the user must know.
     noise_factors : mapping of str to ndarray, optional
-        By label, factors (d,) on stated noise to start from; by default none.
+        Factors (d,) of each label on stated noise to start from; by default none.
     least_gain : float, optional
         Gain of a strength from which on another estimate follows.
     tilt : Tilt, optional
-        Where the minimisation starts; by default constants are held while states are found.
+        Where the minimisation starts; by default constants are fixed while states are found.
     """
 
     trial: Trial
@@ -466,7 +466,7 @@ def node_clock(trial: Trial, frame: LocalFrame) -> str:
     """Return the time offset of the clock of the nodes: of what measures the velocity most often.
 
     Its measurements stay where they are between nodes when its clock moves; with weights of the
-    clock before, that of a DVL was held back 13 times as strongly as the data pulled it.
+    clock before, that of a DVL was damped 13 times as strongly as the data pulled it.
     """
     sensor = trial.dvl or trial.beams or trial.find(Ins) or trial.gnss
     assert sensor is not None
@@ -483,7 +483,7 @@ def _nodes(
     Parameters
     ----------
     trial : Trial
-        Without IMU.
+        Trial without IMU.
     record : AttitudeRecord
         How the body points.
     track : Track

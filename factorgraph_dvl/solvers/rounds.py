@@ -98,7 +98,7 @@ def settle(
     values : dict of str to ndarray, optional
         Parameters to start from; by default mountings that fit the motion.
     clock_zero : float, optional
-        When the offsets of clocks hold, s; by default in the middle of the trial.
+        Reference time of the clock offsets, s; by default in the middle of the trial.
     """
     start, iterations = _start(prepared, states, report, constants_prior, values, clock_zero)
     at = _first(start, report)

@@ -39,7 +39,7 @@ class StateRanges:
     part : callable
         Returns the part of the problem for some segments.
     chain : Chain
-        That of the whole problem.
+        Chain of the whole problem.
     blocks : sequence of slice or None
         Segments of each range; None for all of them.
     before : sequence of gtsam.GaussianFactorGraph
@@ -99,7 +99,7 @@ def eliminated_by_ranges(part: Part, chain: Chain, *, whole: bool = False) -> St
         Returns the part of the problem for some segments, evaluated where it is; for None the
         whole problem. Parts differ in their measurements and factors only.
     chain : Chain
-        That of the whole problem.
+        Chain of the whole problem.
     whole : bool, default False
         Whether there is one range only, however long the chain is.
     """

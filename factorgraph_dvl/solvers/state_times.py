@@ -26,7 +26,7 @@ def dense_epochs(trial: Trial, frame: LocalFrame, interval: float) -> Array | No
     """Return times (M,) at which states are needed besides those every `interval` s.
 
     The angle of the gyros walks by q t within t. Attitudes of variance sigma² each, n of
-    them to a state, must not hang on that state if q interval is not far below sigma²/n.
+    them to a state, must not depend on that state if q interval is not far below sigma²/n.
     """
     settings = trial.inertial.settings
     seen = [s for s in attitudes(trial, frame) if needs_states(s, settings, interval)]

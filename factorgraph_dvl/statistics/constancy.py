@@ -41,7 +41,7 @@ class Change:
     time : float, s
         When.
     size, std : float
-        By how much, after less before, in the unit of the component, and how well that is known.
+        Value after less value before, in the unit of the component, and its standard deviation.
     """
 
     chi2: float
@@ -154,7 +154,7 @@ def by_interval(
     following : dict of int to ndarray
         How every variable follows P components, (size, P) by key.
     edges : ndarray, shape (N - 1,), s
-        Between the intervals.
+        Edges between the intervals.
     """
     size = next(iter(following.values())).shape[1]
     score = np.zeros((edges.size + 1, size))

@@ -15,7 +15,7 @@ that are not known well less certain, and their volume larger. With many states,
 few measurements, the second term is as steep as the first.
 
 **Value.** With the constants eliminated last, the conditionals of the states, R x + T c = d,
-hold everything. Where residuals are linear in x about the evaluation,
+contain everything. Where residuals are linear in x about the evaluation,
 
 .. math::
 

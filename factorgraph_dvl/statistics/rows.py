@@ -70,7 +70,7 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     factors : ndarray, shape (M, d, n)
         Factors of each row.
     sums : dict of int to ndarray
-        By key; changed.
+        Sums by key, which are changed.
     """
     turned = factors.transpose(0, 2, 1)
     for own, matrix in _by_variable(rows):

@@ -94,7 +94,7 @@ def scores(
 ) -> Scores:
     """Return scores and information of parameters that were taken as known.
 
-    The graph holds them as variables with a wide prior, linearised where the fit without them
+    The graph contains them as variables with a wide prior, linearised where the fit without them
     ended, their priors' means being the values there. With P their covariance, the step delta
     to the minimum, and Lambda the information of the priors,
 
@@ -110,7 +110,7 @@ def scores(
     information : SquareRootInformation
         Square-root information of the graph.
     candidates : mapping of str to tuple of (int, ndarray)
-        By name, key and standard deviations (n,) of the wide prior.
+        Key and standard deviations (n,) of the wide prior, by name.
     """
     sizes = [sigma.size for _, sigma in candidates.values()]
     edges = np.cumsum([0, *sizes])

@@ -148,7 +148,7 @@ def spurious_by(
     wanted : sequence of str
         Names of the parameters, of p columns, whose information is asked for.
     clock_zero : float
-        When the offsets of clocks hold, s.
+        Reference time of the clock offsets, s.
     left : ndarray, shape (M, d, d), optional
         What the variables leave of the noise of each, by whitened components; by default all.
     """

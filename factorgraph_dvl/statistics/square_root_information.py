@@ -1,6 +1,6 @@
 """Covariances of any variables from the square root of an information matrix.
 
-The Bayes tree that QR elimination leaves holds the square root R of the information
+The Bayes tree that QR elimination leaves contains the square root R of the information
 matrix clique by clique. Everything here is built from R: squaring it first would lose
 the digits that navigation-grade gyros need.
 """
@@ -187,7 +187,7 @@ class SquareRootInformation:
         Parameters
         ----------
         functionals : sequence of mapping of int to ndarray
-            As in `covariance_with`.
+            The same as for `covariance_with`.
 
         Returns
         -------

@@ -151,7 +151,7 @@ def undetermined_directions(data: Array, spurious: Array) -> Array:
     data : ndarray, shape (P, P)
         Information of the data, beside the prior's identity; what is spurious included.
     spurious : ndarray, shape (P, P)
-        That part of it.
+        Part of the information that is spurious.
     """
     if not data.size or not largest_spurious_share(data, spurious) >= SPURIOUS:
         return np.zeros((data.shape[0], 0))
@@ -165,7 +165,7 @@ def largest_spurious_share(data: Array, spurious: Array) -> Array:
     Parameters
     ----------
     data, spurious : ndarray, shape (..., P, P)
-        As of `undetermined_directions`.
+        The same as for `undetermined_directions`.
     """
     data = 0.5 * (data + np.swapaxes(data, -1, -2))
     L = np.linalg.cholesky(_positive(data) + _LITTLE * np.eye(data.shape[-1]))

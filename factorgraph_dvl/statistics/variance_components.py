@@ -69,9 +69,9 @@ class VarianceComponents:
     Parameters
     ----------
     white : dict of str to NoiseFactor
-        By label, factors on the standard deviations that sensors state.
+        Factors of each label on the standard deviations that sensors state.
     correlated : dict of str to NoiseFactor
-        By label, factors on the innovations of correlated noise, relative to those assumed.
+        Factors of each label on the innovations of correlated noise, relative to those assumed.
     """
 
     white: dict[str, NoiseFactor]
@@ -84,7 +84,7 @@ def log_prior(noise_factors: Mapping[str, Array], observations: Iterable[Observa
     Parameters
     ----------
     noise_factors : mapping of str to ndarray
-        By label, factors (d,).
+        Factors (d,) of each label.
     observations : iterable of Observation
         Their components share factors in groups.
     """

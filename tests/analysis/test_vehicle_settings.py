@@ -147,7 +147,7 @@ def test_water_linked(alpha: np.ndarray) -> None:
     offset = command["parameters"]["mounting_rotation_offset"]
     ahead = from_dvl(alpha, FRD)[:, 0]
     bearing = np.degrees(np.arctan2(ahead[1], ahead[0]))
-    assert abs((bearing - offset + 180.0) % 360.0 - 180.0) <= 0.5
+    assert abs((bearing - offset + 180.0) % 360.0 - 180.0) <= 0.005
     assert 0 <= offset < 360
     assert "scale error: 1.000 %" in text
 

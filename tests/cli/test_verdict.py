@@ -81,16 +81,42 @@ def test_a_result_that_is_not_to_be_used_is_refused(
     assert REFUSAL not in run(*command, "--anyway").err
 
 
-def test_the_conclusion_leaves_room_on_a_screen(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("has_sum", [False, True])
+def test_the_conclusion_leaves_room_on_a_screen(
+    capsys: pytest.CaptureFixture[str], has_sum: bool
+) -> None:
     reasons = [Finding(Code.DOES_NOT_FIT, f"reason {i}", severity="warning") for i in range(9)]
-    found = replace(condemned(), findings=tuple(reasons))
+    if has_sum:
+        reasons.append(Finding(Code.HEADING_ERROR, "the sum", parameter="misalignment_deg"))
+    found = condemned()
+    # A scale error of each axis makes the table longest.
+    scales = tuple(f"scale_error_{axis}" for axis in "xyz")
+    per_axis = [
+        Estimate(
+            e.name,
+            scales,
+            *(np.ones(3) * a for a in (e.value, e.std, e.prior_value, e.prior_std)),
+            np.ones(3, bool),
+        )
+        if e.name == "scale_error"
+        else e
+        for e in found.estimates
+    ]
+    std = np.concatenate([e.std for e in per_axis])
+    found = replace(
+        found, findings=tuple(reasons), estimates=tuple(per_axis), covariance=np.diag(std**2)
+    )
     print_conclusion(found, "Exail", Path("out/report.html"))
     lines = capsys.readouterr().out.splitlines()
-    # The longest table; before it come at most what was rejected, an accuracy, and the files.
+    # Before it come at most what was rejected, an accuracy, and the files.
     assert len(lines) <= 30 - 3
     assert lines[0].startswith("Verdict: doubtful: reason 0")
-    assert any("Delph X3" in line for line in lines)
-    assert any(line.startswith("Further reasons on the page: ") for line in lines)
+    assert "Further reasons: 9" in lines[0]
+    assert [line for line in lines if "reason" in line][1:] == [
+        f"warning: reason {i}" for i in (1, 2)
+    ]
+    assert ("Mount and compass: the sum" in lines) == has_sum
+    assert any("Delph XV3" in line for line in lines)
     assert lines[-1] == "Open out/report.html"
 
 

@@ -190,6 +190,11 @@ BAD_SETTINGS = {
     "tab": ("body_axes: RFU", "\tbody_axes: RFU", "a tab, where YAML takes spaces only"),
     "colon": ("body_axes: RFU", "body_axes: RFU: b", "a colon within a value (put it in quotes)"),
     "unit": ("[0.02, 0.02, 0.04]", "[20 mm, 0, 0]", "in m, without a unit: 0.02"),
+    "unit of a list": (
+        "[0.02, 0.02, 0.04]",
+        "2 cm",
+        "a list of numbers in m, without a unit: 0.02",
+    ),
     "other unit": ("time_offset_s: 0.0", "time_offset_s: 2 m", "in s, without a unit"),
     "no number": ("time_offset_s: 0.0", "time_offset_s: late", "expected a number in s"),
     "tag": ("body_axes: RFU", "body_axes: !!python/name:os.system RFU", "body_axes", "plain"),

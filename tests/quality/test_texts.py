@@ -14,7 +14,8 @@ from prose import faults, split
 import factorgraph_dvl
 from factorgraph_dvl.message import Message, either, encoded, message
 from factorgraph_dvl.quality.finding import Code
-from factorgraph_dvl.quality.texts import catalogue, decoded, text_of
+from factorgraph_dvl.quality.texts import catalogue, chinese, decoded, text_of
+from factorgraph_dvl.solvers import steps
 
 PACKAGE = Path(factorgraph_dvl.__file__).parent
 KEYS = {f"{group}.{name}" for group, own in catalogue("messages").items() for name in own}
@@ -150,3 +151,16 @@ def test_words_can_be_hidden():
     hidden = said.with_words(lambda text: text.replace(".json", ""))
     assert isinstance(hidden, Message)
     assert text_of(hidden) == "cruise is graded `do not use`: a or b"
+
+
+def test_components_have_the_names_of_their_parameters_in_chinese():
+    assert chinese("misalignment x") == "安装误差角 x"
+    assert chinese("GNSS lever arm z") == "GNSS 杆臂 z"
+    assert chinese("x") == "x"
+
+
+def test_steps_of_the_solver_have_chinese_names():
+    kinds = [kind for kind in vars(steps).values() if isinstance(kind, type)]
+    names = {name for kind in kinds if isinstance(name := getattr(kind, "name", None), str)}
+    assert "gross errors" in names
+    assert [name for name in sorted(names | {"start"}) if chinese(name) == name] == []

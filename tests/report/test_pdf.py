@@ -47,12 +47,12 @@ def sheets(monkeypatch):
     """Return what was written on each sheet."""
     made: list[sheet.Sheet] = []
 
-    class Seen(sheet.Sheet):
+    class Kept(sheet.Sheet):
         def __init__(self, *given: str) -> None:
             super().__init__(*given)
             made.append(self)
 
-    monkeypatch.setattr(document, "Sheet", Seen)
+    monkeypatch.setattr(document, "Sheet", Kept)
     return made
 
 

@@ -11,7 +11,7 @@ from matplotlib.patches import Ellipse
 from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.report.figures.drawing import DARK, GREY, PALE, SMALL
-from factorgraph_dvl.report.vessel import SHORTEST, Place, beams, ellipse, seen
+from factorgraph_dvl.report.vessel import SHORTEST, Place, beams, ellipse, label_places, seen
 
 # Chosen: free space, axes and beams, as shares of the width of a vessel.
 _FREE, _AXIS, _BEAM = 0.9, 0.3, 0.45
@@ -72,17 +72,17 @@ def draw_vessel(
     for place, xy in zip(places, points, strict=True):
         _draw_ellipse(ax, xy, view @ place.covariance @ view.T)
     ax.plot(*points.T, "o", color=DARK, ms=4)
-    # A name stands on the side without other points; that of the DVL, where its axes leave room.
-    sides = [*(points[:-1] - points.mean(axis=0)), -(view @ axes.sum(axis=1))]
-    done: list[Array] = []
-    for place, xy, side in zip(places, points, sides, strict=True):
-        lines = sum(float(np.hypot(*(xy - other))) < 0.08 * span for other in done)
-        done.append(xy)
-        right, up = side >= -1e-9
+    # A name is on the side without other points; that of the DVL, where its axes leave room.
+    sides = np.stack([*(points[:-1] - points.mean(axis=0)), -(view @ axes.sum(axis=1))])
+    names = [said(place.name) for place in places]
+    scale = 72.0 * min(box.width / wide, box.height / tall) / (2.0 * ax.figure.dpi)
+    widths = [SMALL * sum(0.7 if letter.isascii() else 1.1 for letter in name) for name in names]
+    found = label_places(points * [scale, -scale], sides * [1.0, -1.0], widths, 1.3 * SMALL)
+    for name, xy, (right, below, far) in zip(names, points, found, strict=True):
         ax.annotate(
-            said(place.name), xy, (5 if right else -5, (1 if up else -1) * (5 + 9 * lines)),
+            name, xy, (0.65 * SMALL * (1 if right else -1), -far if below else far),
             textcoords="offset points", fontsize=SMALL, fontweight="bold", color=DARK,
-            ha="left" if right else "right", va="bottom" if up else "top",
+            ha="left" if right else "right", va="top" if below else "bottom",
         )  # fmt: skip
 
 

@@ -7,25 +7,27 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from factorgraph_dvl.analysis.instrument_terms import (
+    NORTEK_AXES,
     ORDERS,
+    TRDI_AXES,
+    WATER_LINKED_AXES,
     Angles,
     InstrumentTerms,
     Order,
     instrument_of,
 )
-from factorgraph_dvl.analysis.mount import mount_in_words
+from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.quality.notation import at_precision, fixed
+from factorgraph_dvl.quality.notation import at_precision, fixed, sentence
 from factorgraph_dvl.quality.verdict import Grade, Verdict
 from factorgraph_dvl.report.entries import (
+    RECORDED_AXES,
     REFUSED,
     TITLE,
-    conventions,
+    definitions,
     entries_of,
     hundredths,
-    looks_up,
-    looks_up_for_trdi,
     sum_with_compass,
     worst,
 )
@@ -39,7 +41,9 @@ _ORDER_TEXT: dict[Order, str] = {
 
 def verdict_text(verdict: Verdict) -> str:
     """Return the verdict and all its reasons as comments of YAML, a line each."""
-    reasons = (f"#   {r.severity}: {printable(str(r))}. {r.code.action}" for r in verdict.reasons)
+    reasons = (
+        f"#   {r.severity}: {sentence(printable(str(r)))} {r.code.action}" for r in verdict.reasons
+    )
     return "\n".join([f"# Verdict: {verdict.grade}", *reasons]) + "\n"
 
 
@@ -66,9 +70,9 @@ def instrument_text(calibration: Calibration | Solution) -> str:
         "# starboard axis (positive bow up), yaw about the downward axis (positive clockwise from",
         "# above). The DVL's axes are named as the body's are: if aligned, it has zero angles.",
         "",
-        f"# {TITLE}. {conventions(i)[0]}",
+        f"# {TITLE}. {definitions(i)[0]}",
         "# The DVL reads (1 + scale error) times the velocity.",
-        f"# {conventions(i)[2]}",
+        *(f"# {said}" for said in definitions(i)[1:]),
         "enter_in_dvl:",
         *(
             _line(
@@ -136,13 +140,13 @@ def _trdi(i: InstrumentTerms, grade: Grade) -> Iterator[str]:
         "# TRDI, 0.01 deg. EA is the direction of beam 3 seen from the ship's bow, positive",
         "# clockwise from above. EI and EJ are roll and pitch of the ship when the instrument is",
         "# level, positive port side up and bow up: Rz(-EA) Ry(EJ) Rx(EI) takes ship to",
-        "# instrument. They are valid for a DVL that looks down, if the trial was recorded in",
-        "# instrument coordinates (aligned: X to starboard, Y, beam 3, ahead, Z up) with EA, EI",
-        "# and EJ at 0, and if the body axes are parallel to those of the ship. EI and EJ are as",
-        "# in the Pathfinder DVL Guide (2018). The sign of EA is NOT VERIFIED against a manual.",
+        "# instrument. They are valid for a DVL that looks down, if EA, EI and EJ were 0 in the",
+        "# trial, and if the body axes are parallel to those of the ship. Sign rules: Pathfinder",
+        "# DVL Guide (2018) for EI and EJ, RiverPro and RioPro ADCP Guide (2017) for EA.",
+        f"# {RECORDED_AXES[i.axes_as(TRDI_AXES)]}",
     )
-    if looks_up_for_trdi(i):
-        yield from _NOT_TRDI
+    if not looks_down(i.attitude_as(TRDI_AXES)):
+        yield _LOOKS_UP
     yield "trdi:"
     for name, value, std in zip(
         ("EA", "EI", "EJ"), i.alignment.tolist(), i.alignment_std.tolist(), strict=True
@@ -154,43 +158,45 @@ def _trdi(i: InstrumentTerms, grade: Grade) -> Iterator[str]:
 def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iterator[str]:
     """Yield the calibration in the conventions of other makers, with their sign rules."""
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
+    water_linked = i.attitude_as(WATER_LINKED_AXES)
+    tilt = float(np.hypot(*i.as_frd.value[:2]))
     mean = float(np.mean(i.scale_error))
     forward, starboard, down = (float(x) for x in i.lever_arm)
-    tilt = float(np.hypot(roll, pitch))
     yield from (
         "",
         "# Nortek: attitude of the DVL in the vehicle, axes forward, starboard, down; yaw first,",
-        "# then pitch, then roll; each positive by the right hand about its axis.",
-        f"# {_NOT_VERIFIED}",
+        "# then pitch, then roll; each positive by the right hand about its axis. Sign rule of",
+        "# yaw: DVL manual (2017), from the vehicle's forward axis to the DVL's X axis, and",
+        "# Signature VM manual, clockwise. The signs of roll and pitch are NOT VERIFIED against a",
+        "# manual: check one of them before use.",
+        f"# {RECORDED_AXES[i.axes_as(NORTEK_AXES)]}",
         "nortek:",
-        _line(f"  roll_pitch_yaw_deg: {_list([roll, pitch, yaw], 2)}", angles),
+        _line(f"  roll_pitch_yaw_deg: {_list(i.as_frd.value, 2)}", angles),
         "",
         "# Water Linked: one angle, from the vehicle's forward axis to that of the DVL, positive",
-        "# clockwise from above, in whole degrees from 0 to 359. Sign rule: DVL documentation,",
-        f"# page Axes. The angle is {fixed(yaw, 2)} deg; the rest and the tilt of "
-        f"{fixed(tilt, 2)} deg are left out.",
-        *(("# DO NOT TYPE IN: the DVL's axes look up.",) if looks_up(i) else ()),
+        "# clockwise from above, from 0 to 360 deg; software before 2.2.1 takes whole degrees.",
+        f"# Sign rule: DVL documentation, page Axes. Left out: tilt of {fixed(tilt, 2)} deg.",
+        f"# {RECORDED_AXES[i.axes_as(WATER_LINKED_AXES)]}",
+        *(() if looks_down(water_linked) else (_LOOKS_UP,)),
         "water_linked:",
-        _line(f"  mounting_rotation_offset: {round(yaw) % 360}", i.dvl_in_body["ZYX"].grade[2]),
+        _line(
+            f"  mounting_rotation_offset: {fixed(i.rotation_offset, 2)}",
+            i.dvl_in_body["ZYX"].grade[2],
+        ),
         "",
-        "# Delph-style: axes X1 forward, X2 to port, X3 up. Heading is positive clockwise from",
-        "# above, roll positive port side up, pitch positive bow down. The scale factor is what",
-        f"# the DVL reads too much, in %; the lever arm runs from the {i.origin} to the DVL.",
-        f"# {_NOT_VERIFIED}",
+        "# Delph-style: axes XV1 forward, XV2 to port, XV3 up: Advanced Configuration User Guide",
+        f"# of OCTANS (2015). The lever arm runs from the {i.origin} to the DVL. Heading is",
+        "# positive clockwise from above, roll positive port side up, pitch positive bow down.",
+        "# The scale factor is what the DVL reads too much, in %. The signs of the angles and of",
+        "# the scale factor are NOT VERIFIED against a manual: check one of them before use.",
         "delph:",
         _line(f"  heading_pitch_roll_deg: {_list([yaw, -pitch, roll], 4)}", angles),
         _line(f"  scale_factor_percent: {fixed(100.0 * mean, 4)}", scale),
-        _line(f"  lever_arm_x1_x2_x3_m: {_list([forward, -starboard, -down], 4)}", arm),
+        _line(f"  lever_arm_xv1_xv2_xv3_m: {_list([forward, -starboard, -down], 4)}", arm),
     )
 
 
-_NOT_VERIFIED = (
-    "The signs are NOT VERIFIED against the maker's manual: check one of them before use."
-)
-_NOT_TRDI = (
-    "# DO NOT TYPE IN: with these values, the instrument would look up. The DVL's data in this",
-    "# trial are in other axes than TRDI's; convert them, and calibrate again.",
-)
+_LOOKS_UP = "# DO NOT TYPE IN: with these values, the instrument would not look down."
 
 
 def _angles(by_order: dict[Order, Angles]) -> Iterator[str]:

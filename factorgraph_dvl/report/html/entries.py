@@ -24,7 +24,7 @@ def entries_content(result: Result) -> Iterator[Html]:
     yield vessel_drawing(terms, result.solution, result.run.get("settings", {}))
 
 
-def values_to_enter(terms: InstrumentTerms, maker: str = "") -> Html:
+def values_to_enter(terms: InstrumentTerms, maker: str | None = None) -> Html:
     """Return the table of what to enter, with its conventions."""
     return joined(
         described(entries_table(terms, maker), label=TITLE),

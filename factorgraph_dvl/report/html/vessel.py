@@ -28,6 +28,7 @@ from factorgraph_dvl.report.vessel import (
     Place,
     beams,
     ellipse,
+    label_places,
     places_of,
     seen,
 )
@@ -37,8 +38,8 @@ from factorgraph_dvl.solution import Solution
 _SIZE, _MARGIN = 360.0, 124.0
 # Length of the DVL's axes and beams, in units of the drawing. Chosen: their directions are seen.
 _AXIS, _BEAM = 54.0, 76.0
-# Points that are closer have one label, in units of the drawing.
-_APART = 16.0
+# Height of a name, and width of a letter of it, in units of the drawing.
+_LINE, _LETTER = 16.0, 8.7
 # Chosen: an ellipse widens a vessel at most so many times.
 _WIDEST = 1.0
 
@@ -76,13 +77,10 @@ def vessel_drawing(
 
 def _view(view: Array, places: Sequence[Place], axes: Array, title: str) -> Html:
     """Return a drawing of one view (2, 3): what is seen to the right, and upward."""
-    points, _, span = seen(view, places)
-    spread = [np.sqrt(np.maximum(np.diag(view @ p.covariance @ view.T), 0.0)) for p in places]
-    reach = np.minimum(SIGMAS * np.stack(spread), _WIDEST * span)
-    low, high = (points - reach).min(axis=0), (points + reach).max(axis=0)
-    span = max(float((high - low).max()), span)
+    points, middle, span = seen(view, places)
+    largest = SIGMAS * np.sqrt(max(np.diag(p.covariance).max() for p in places))
+    span += 2.0 * min(float(largest), _WIDEST * span)
     scale = (_SIZE - 2.0 * _MARGIN) / span
-    middle = 0.5 * (low + high)
 
     def pixel(p: Array) -> Array:
         return 0.5 * _SIZE + (p - middle) * [scale, -scale]
@@ -130,20 +128,18 @@ def _dvl(at: Array, view: Array, axes: Array) -> Iterator[str]:
 
 
 def _names(at: Array, names: Sequence[str], free: Array) -> Iterator[str]:
-    """Yield the names of the points, a line for each of those that are close together.
+    """Yield the names of the points.
 
-    A name stands on the side of its point on which there are no others; that of the last, the
-    DVL, on the side that its axes leave free.
+    A name is on the side of its point on which there are no others; that of the last, the DVL,
+    on the side that its axes leave free.
     """
-    done: list[tuple[Array, int]] = []
-    for xy, name in zip(at, names, strict=True):
-        near = [n for other, n in done if np.hypot(*(xy - other)) < _APART]
-        line = max(near, default=-1) + 1
-        done.append((xy, line))
-        side = free if name == "DVL" else xy - at.mean(axis=0)
-        right = side[0] >= 0.0
-        x = xy[0] + (9.0 if right else -9.0)
-        y = xy[1] + (16.0 if side[1] >= 0.0 else -8.0) + 15.0 * line
+    sides = np.stack([*(at[:-1] - at.mean(axis=0)), free])
+    widths = [_LETTER * len(name) for name in names]
+    found = label_places(at, sides, widths, _LINE)
+    for xy, name, (right, below, far) in zip(at, names, found, strict=True):
+        x = xy[0] + (0.5 if right else -0.5) * _LINE
+        # The line on which letters are is a quarter above the bottom of their box.
+        y = xy[1] + (far + 0.75 * _LINE if below else -far - 0.25 * _LINE)
         anchor = "start" if right else "end"
         yield (
             f'<text class="place" text-anchor="{anchor}" x="{x:.1f}" y="{y:.1f}">'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -212,7 +213,8 @@ def fonts(language: Language) -> list[str]:
 
 def _words(text: str, language: Language) -> list[str]:
     if language == "zh":
-        return list(text)
+        # No line begins with a closing mark.
+        return re.findall(r".[，。、；：！？）”]*", text)
     return [word + " " for word in text.split()]
 
 

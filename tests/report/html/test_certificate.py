@@ -14,6 +14,7 @@ from running import Run, run
 
 from factorgraph_dvl import load_trial, save_trial
 from factorgraph_dvl.errors import ConfigError
+from factorgraph_dvl.report.certificate import statements
 from factorgraph_dvl.report.html.page import report_page
 
 __all__ = ["run"]
@@ -70,6 +71,14 @@ def test_the_page_prints_the_certificate(trial: Path, tmp_path: Path, run: Run) 
     # The page can be made again.
     assert run("report", out).code == 0
     assert certificate in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_date_that_is_not_stated_is_named() -> None:
+    for stated, expected in (
+        ({}, (("date",), "not stated")),
+        ({"epoch": "2022"}, (("recorded from",), "2022")),
+    ):
+        assert next(iter(statements(build_result(run=stated)))) == expected
 
 
 def test_a_certificate_survives_saving(trial: Path, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from reports import build_result
 
 from factorgraph_dvl.analysis.instrument_terms import instrument_of
 from factorgraph_dvl.report.html.vessel import vessel_drawing
+from factorgraph_dvl.report.vessel import label_places
 from factorgraph_dvl.solution import Solution
 
 # Right, forward, up: the antenna is 6 m above the IMU and 1 m astern.
@@ -83,6 +84,24 @@ def test_axes_are_turned_as_found(alpha: list[float], above: tuple, side: tuple)
                 assert found is None
             else:
                 np.testing.assert_allclose(found, direction, atol=0.01)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.3, -0.3])
+def test_names_are_not_on_each_other_where_instruments_are_close(off: float) -> None:
+    """On one mast, IMU, antenna and DVL are nearly at one place seen from above."""
+    at = np.array([[0.0, 0.0], [16.0 * off, 4.0 * off], [20.0 * off, 0.0]])
+    widths, height = [26.0, 104.0, 26.0], 16.0
+    boxes = []
+    sides = np.stack([*(at[:-1] - at.mean(axis=0)), np.array([-1.0, 1.0])])
+    for (x, y), width, (right, below, far) in zip(
+        at, widths, label_places(at, sides, widths, height), strict=True
+    ):
+        left = x + (8.0 if right else -8.0 - width)
+        top = y + (far if below else -far - height)
+        boxes.append((left, top, left + width, top + height))
+    for k, a in enumerate(boxes):
+        for b in boxes[:k]:
+            assert a[2] <= b[0] or b[2] <= a[0] or a[3] <= b[1] or b[3] <= a[1]
 
 
 def test_beams_are_on_the_side_on_which_the_dvl_looks() -> None:

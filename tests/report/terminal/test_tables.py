@@ -9,9 +9,10 @@ from builders import build_solution, build_trial
 from rich.console import Console
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.estimates import Cause
 from factorgraph_dvl.plausibility.survey import survey
-from factorgraph_dvl.quality.notation import at_precision, fixed, split_unit, with_std
+from factorgraph_dvl.quality.notation import at_precision, fixed, sentence, split_unit, with_std
 from factorgraph_dvl.report.table import Table
 from factorgraph_dvl.report.tables import (
     calibration_table,
@@ -137,3 +138,10 @@ def test_an_error_budget_fits_80_columns() -> None:
     assert width_of(rendered(table, 80)) <= 80
     shown = printed(table, 80)
     assert all(name in shown for name in causes)
+
+
+def test_a_question_has_no_full_stop() -> None:
+    assert sentence("is it in m/s?") == "is it in m/s?"
+    assert sentence("it is in m/s") == "it is in m/s."
+    error = DataError("is it in m/s?", hint="Check the units.")
+    assert str(error) == "is it in m/s? Check the units."
