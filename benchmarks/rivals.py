@@ -269,10 +269,10 @@ method gets the statements of the trial, and no tuning by scenario.
 
 The methods estimate different things, so one number compares them: the velocity of the calibrated
 DVL that is still wrong along the track, as RMS over that of the speed. It includes the effect of
-everything that a method neglects. So `kinsey-whitcomb`, which has no scale as published, keeps the
-scale error of 17.7 ‰, `three-points` keeps the angle about the bow as the trial states it, and
-`joyce` and `pollard-read`, which fit horizontal velocities, keep the tilts. `three-points` follows
-the abstract of its publication ([what is known](kalman.md#second-point-set-the-calibrators)).
+everything that a method neglects. As published, `kinsey-whitcomb` has no scale: it keeps the scale
+error of 17.7 ‰. `three-points` keeps the angle about the bow as the trial states it. `joyce` and
+`pollard-read` fit horizontal velocities and keep the tilts. `three-points` follows the abstract of
+its publication: [what is known of it](kalman.md#second-point-set-the-calibrators).
 The heading error of SINS/GNSS is new in each seed. It is most of the error in scenarios 5 and 7:
 few seeds do not rank the methods there.
 """
