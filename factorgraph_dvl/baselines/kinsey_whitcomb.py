@@ -6,8 +6,9 @@ With y = R u, R constant, the estimate turns towards what it predicts wrongly,
 
 and converges from almost any start where u turns in the body. Here u is the velocity of the body
 at the DVL, by SINS/GNSS, and y that of the DVL. There is no scale, no lever arm, no noise and no
-covariance in it. The gain k is free. All pings are steps of the same length: a gap between two of
-them would else be one long step, which turns too far.
+covariance in it. The gain k is free. Over a ping u and y are constant, and the equation is solved
+exactly: the angle e between R u and y follows tan(e / 2) ~ exp(-k |u| |y| t). All pings are steps
+of the same length t: a gap between two of them says no more than a ping.
 
 J. C. Kinsey and L. L. Whitcomb, Adaptive identification on the group of rigid-body rotations and
 its application to underwater vehicle navigation, IEEE Trans. Robotics 23(1), 124-136, 2007.
@@ -45,6 +46,17 @@ def kinsey_whitcomb(points: Points, misalignment: Parameter, lever_arm: Array) -
     R, u = exp_so3(misalignment.mean), points.at_dvl(lever_arm)
     power = float(np.sum(u**2))
     gain = _PER_PING * len(points) / power if power > 0.0 else 0.0
-    for k in range(len(points)):
-        R = exp_so3(gain * np.cross(R @ u[k], points.v_d[k])) @ R
+    for u_k, y in zip(u, points.v_d, strict=True):
+        R = exp_so3(_turn(R @ u_k, y, gain)) @ R
     return Outcome(by_residuals(points, (misalignment,), (R,), lever_arm), 1)
+
+
+def _turn(a: Array, b: Array, gain: float) -> Array:
+    """Return how far a vector turns towards another by da/dt = gain (a x b) x a, t = 1."""
+    axis = np.cross(a, b)
+    sine, product = float(np.linalg.norm(axis)), float(np.linalg.norm(a) * np.linalg.norm(b))
+    if sine == 0.0:
+        return axis
+    both = product + float(a @ b)
+    left = np.arctan2(np.exp(-gain * product) * sine, both)
+    return 2.0 * (np.arctan2(sine, both) - left) / sine * axis

@@ -19,7 +19,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from factorgraph_dvl.baselines.outcome import History
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.estimates import Estimate, Residuals, Trajectory
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import message
@@ -100,8 +100,13 @@ def filter_planar(
     ConfigError, DataError
         If the trial has no compass, log, depth sensor or beacons, or no position to start from.
     """
-    for needed in (Heading, Depth):
-        trial.required(needed)
+    if not trial.planar:
+        raise ConfigError(
+            f"{method} navigates in the plane by a beacon, and this trial is not planar",
+            where="trial.yaml",
+            expected="sections heading, log, depth and beacons",
+        )
+    trial.required(Depth)
     if trial.initial_position is None:
         raise DataError(
             "the trial has no position to start from",

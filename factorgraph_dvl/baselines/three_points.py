@@ -1,4 +1,4 @@
-"""Three points: angles and scale from displacements between fixes (Tang, Wang, Li and Wu 2013).
+"""Three points: angles and scale from displacements between fixes (after Tang et al. 2013).
 
 What dead reckoning by attitude and DVL makes of the way between three points, first, middle and
 last, is compared with their positions,
@@ -7,17 +7,21 @@ last, is compared with their positions,
 
 and the angles across the bow and the scale follow, again and again until nothing changes. A
 vehicle moves along its bow: so the search starts with the mean velocity of the DVL along it, and
-the angle about the bow stays that of the prior. Nothing but three
-positions is needed of GNSS; here they and the attitude are those of SINS/GNSS. The standard
-deviations are those that the positions make, as the publication has none.
+the angle about the bow stays that of the prior. Nothing but three positions is needed of GNSS;
+here they and the attitude are those of SINS/GNSS. The standard deviations are those that the
+positions make.
 
 K. Tang, J. Wang, W. Li and W. Wu, A novel INS and Doppler sensors calibration method for long
-range underwater vehicle navigation, Sensors 13(11), 14583-14600, 2013. Its equations are not at
-hand: these follow from its abstract and what others write of it.
+range underwater vehicle navigation, Sensors 13(11), 14583-14600, 2013. At hand is its abstract: a
+calibration of the scale of the DVL and of the misalignments between INS and DVL, repeated to
+reduce what the alignment of the INS leaves. All else is assumed: the equation above, three points
+and which, that the angle about the bow is not sought, and the standard deviations. SINS/GNSS
+leaves no error of an alignment, so the repetition here is that of Gauss and Newton.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -63,6 +67,8 @@ def three_points(
         return Outcome(prior, 1)
     rows = (0, len(v_d) // 2, len(v_d) - 1)
     frame = LocalFrame(*motion.geodetic[0])
+    level = frame.level_from_tangent(*motion.geodetic[:, :2].T)
+    motion = replace(motion, nRb=level.transpose(0, 2, 1) @ motion.nRb)
     moved = frame.position(*motion.geodetic.T) + rotate(motion.nRb, lever_arm[None])
     truth = np.diff(moved[list(rows)], axis=0)
     # The legs have the middle point in common.

@@ -385,7 +385,10 @@ def _print_solution(trial: Trial, found: _Found, *, details: bool) -> None:
             print_error_budget(solution)
         accuracy = paper_accuracy(solution.estimates, truth)
         if isfinite(accuracy):
-            text = "Accuracy, mean of 1 − |error / truth| of misalignment, scale and lever arm: "
+            text = (
+                "Accuracy, mean of 1 − |error / truth| of what the method estimates of "
+                "misalignment, scale and lever arm: "
+            )
             stdout().print(f"{text}{accuracy:.2f} %", markup=False, soft_wrap=True)
     if found.halves is not None:
         print_table(halves_table(found.halves), "unit", "second")

@@ -364,7 +364,7 @@ def _geometry(seeds: int) -> Result:
     ratio.plot(time, cosine, color=ACCENT, lw=1.2, label="cosine of the bearing from the course")
     ratio.plot(time, radial / speed, color=DARK, lw=0.9, ls="--", label="v_r / u")
     ratio.legend(fontsize=7)
-    style(ratio, "time, s", "")
+    style(ratio, "time, s", "v_r / u")
     return Result(
         f"v_r / u against the cosine of the angle between course and line of sight: {apart:.0e}",
         judged(apart < 1e-4),
@@ -392,8 +392,8 @@ def _figure_4(seeds: int) -> Result:
         ax.plot(*_truth(trial, tracks[0].time).T, color=DARK, lw=1.0, ls="--", label="true")
         for found, method, color in zip(tracks, _METHODS, (GREY, ACCENT), strict=True):
             ax.plot(*found.state[:, :2].T, color=color, lw=0.9, label=method)
-        ax.set_xlim(-1500, 1500)
-        ax.set_ylim(-1500, 1500)
+        ax.set_xlim(-700, 700)
+        ax.set_ylim(-200, 1200)
         ax.set_title(title, fontsize=9, loc="left")
         style(ax, "east, m", "north, m")
     figure.axes[0].legend(fontsize=7)

@@ -20,7 +20,15 @@ from factorgraph_dvl.geometry.rotations import (
 )
 from factorgraph_dvl.geometry.units import ARCSEC, DEG, DEG_PER_HOUR
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.report.figures.drawing import ACCENT, DARK, GREY, new_figure, new_grid, style
+from factorgraph_dvl.report.figures.drawing import (
+    ACCENT,
+    ACCENT_LIGHT,
+    DARK,
+    GREY,
+    new_figure,
+    new_grid,
+    style,
+)
 from factorgraph_dvl.reproduce.entry import Entry, Paper, Result, counted, judged, scenario, table
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.simulation import simulate
@@ -362,25 +370,26 @@ def _equation_17(seeds: int) -> Result:
 
 
 def _figures(seeds: int, axis: int) -> Result:
+    # They lie upon one another: the first is the widest.
     curves = {
-        f"as printed, heading {_NORTH_DEG:g}°": ("liu-2020", _NORTH_DEG, ACCENT),
-        f"as printed, heading {_HEADING_DEG:g}°": ("liu-2020", _HEADING_DEG, GREY),
-        f"½ C_b^n, heading {_HEADING_DEG:g}°": ("star", _HEADING_DEG, "tab:orange"),
+        f"as printed, heading {_NORTH_DEG:g}°": ("liu-2020", _NORTH_DEG, ACCENT_LIGHT, 4.0),
+        f"as printed, heading {_HEADING_DEG:g}°": ("liu-2020", _HEADING_DEG, GREY, 2.0),
+        f"½ C_b^n, heading {_HEADING_DEG:g}°": ("star", _HEADING_DEG, ACCENT, 0.8),
     }
     figure = new_figure(8.0, 3.6)
     ax = figure.add_subplot(new_grid(figure, 1, 1)[0, 0])
     time = np.linspace(5.0, 300.0, 400)
     bound = np.array([_bound(t) for t in time])
     ax.fill_between(time, _DRIFTS[axis] - bound, _DRIFTS[axis] + bound, color="0.9", label="bound")
-    for label, (method, heading, color) in curves.items():
+    for label, (method, heading, color, width) in curves.items():
         history = _run("star", 0, method, heading).history
         assert history is not None
-        ax.plot(history.time, history.values[:, axis], color=color, lw=0.9, label=label)
+        ax.plot(history.time, history.values[:, axis], color=color, lw=width, label=label)
     ax.axhline(_DRIFTS[axis], color=DARK, lw=0.8, ls="--", label="true")
     ax.set_ylim(-0.1, 0.4)
     style(ax, "time, s", f"drift {'xyz'[axis]}, °/h")
     ax.legend(fontsize=7)
-    found = [_means(seeds, method, heading)[axis] for method, heading, _ in curves.values()]
+    found = [_means(seeds, method, heading)[axis] for method, heading, *_ in curves.values()]
     wide = 4.0 * float(_run("star", 0, "star").std[axis]) / np.sqrt(seeds)
     close = [abs(x - _DRIFTS[axis]) < wide for x in found]
     return Result(

@@ -48,6 +48,8 @@ _LAST_S = 100.0
 # Factor of R and threshold, deg: as tuned, and each by itself as one would take it at first.
 _TUNINGS = ((NOISE_FACTOR, THRESHOLD / DEG), (1.0, THRESHOLD / DEG), (NOISE_FACTOR, 5.0))
 _MOST = 1.0 - 0.01 * _TABLE_4_PERCENT.min()
+# Of the seven, the one that the text says converges slowly: α_y.
+_SLOW = 1
 _SEVEN = ("misalignment_deg", "scale_error", "lever_arm_m")
 
 
@@ -165,7 +167,7 @@ def _figure_4(method: str) -> Callable[[int], Result]:
     """Return the check of whether a filter settles as figure 4 has it."""
 
     def check(seeds: int) -> Result:
-        spans, said = [], []
+        spans, others, said = [], [], []
         for phase in _PHASES:
             of_phase = []
             for seed in range(seeds):
@@ -173,7 +175,9 @@ def _figure_4(method: str) -> Callable[[int], Result]:
                 assert history is not None
                 late = history.time > history.time[-1] - _LAST_S
                 of_phase.append(np.ptp(history.values[late], axis=0) / np.abs(TRUE))
-            worst = int(np.argmax(np.max(of_phase, axis=0)))
+            largest = np.max(of_phase, axis=0)
+            worst = int(np.argmax(largest))
+            others.append(float(np.delete(largest, _SLOW).max()))
             low, high = (100.0 * f(np.array(of_phase)[:, worst]) for f in (np.min, np.max))
             spans.append(0.01 * high)
             said.append(
@@ -182,7 +186,9 @@ def _figure_4(method: str) -> Callable[[int], Result]:
             )
         return Result(
             f"over the last {_LAST_S:.0f} s " + ", ".join(said) + f" ({counted(seeds)}; the "
-            f"largest error of table 4 is {100 * _MOST:.1f} %); the phase is not printed",
+            f"largest error of table 4 is {100 * _MOST:.1f} %). The text says that α_y converges "
+            f"slowly: the other six span {100 * max(others):.1f} % at most. The phase is not "
+            "printed",
             judged(max(spans) < _MOST),
             (),
             _curves(method),
@@ -200,7 +206,8 @@ def _curves(method: str) -> Figure:
         assert history is not None
         for row, label in enumerate(_LABELS):
             ax = figure.add_subplot(grid[row, column])
-            reach = 3.0 * abs(_TABLE_4[row] - TRUE[row])
+            late = np.abs(history.values[history.time.size // 2 :, row] - TRUE[row]).max()
+            reach = 1.05 * max(3.0 * abs(_TABLE_4[row] - TRUE[row]), late)
             ax.plot(history.time, history.values[:, row], color=ACCENT, lw=0.9, label=method)
             ax.axhline(TRUE[row], color=DARK, lw=0.8, ls="--", label="true")
             ax.axhline(_TABLE_4[row], color=GREY, lw=0.8, ls=":", label="table 4")

@@ -59,7 +59,7 @@ def test_adaptive_identification_converges_at_any_scale(turn):
 
 
 def test_one_step_of_adaptive_identification_by_hand():
-    # Ahead is taken for starboard: the estimate turns by a tenth of the sine about the vertical.
+    # Ahead is taken for starboard: the estimate turns about the vertical.
     ahead = replace(
         rows_of(exact_points(2), slice(0, 1)),
         v_b=np.array([[0.0, 2.0, 0.0]]),
@@ -67,7 +67,19 @@ def test_one_step_of_adaptive_identification_by_hand():
         v_d=np.array([[2.0, 0.0, 0.0]]),
     )
     R = kinsey_whitcomb(ahead, MISALIGNMENT, np.zeros(3)).estimated.values[0]
-    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, -0.1], atol=1e-12)
+    # From a right angle on, tan(e / 2) falls by the factor exp(-0.1).
+    left = 2.0 * np.arctan(np.exp(-0.1))
+    np.testing.assert_allclose(log_so3(R), [0.0, 0.0, left - np.pi / 2.0], atol=1e-12)
+
+
+def test_adaptive_identification_bears_a_vehicle_that_mostly_rests():
+    """The mean speed sets the gain: steps of Euler turn too far where the speed is high."""
+    turn = exp_so3(np.array([0.0, 0.0, 0.5]))
+    points = exact_points(2000)
+    v_b = np.where(np.arange(2000) < 1980, 0.01, 1.0)[:, None] * points.v_b
+    resting = replace(points, v_b=v_b, omega_b=np.zeros((2000, 3)), v_d=v_b @ turn.T)
+    R = kinsey_whitcomb(resting, MISALIGNMENT, np.zeros(3)).estimated.values[0]
+    assert angle(R, turn) < 1e-6
 
 
 def test_a_gap_between_pings_is_no_long_step():
@@ -79,26 +91,30 @@ def test_a_gap_between_pings_is_no_long_step():
     np.testing.assert_array_equal(found, same)
 
 
-def track(R, scale, arm, *, straight=False):
-    """A level vehicle along two legs, and what its DVL measures."""
-    time = np.arange(0.0, 400.0, 0.2)
-    psi = np.zeros_like(time) if straight else np.where(time < 200.0, 0.3, 2.0)
+def track(R, scale, *, leg=200.0):
+    """A vehicle along two legs, and what its DVL measures: level where it starts."""
+    time = np.arange(0.0, 2.0 * leg, leg / 1000.0)
+    psi = np.where(time < leg, 0.3, 2.0)
     nRb = exp_so3(np.column_stack([np.zeros((time.size, 2)), psi]))
     v_b = np.tile([0.0, 3.0, 0.0], (time.size, 1))
     v_n = rotate(nRb, v_b)
-    steps = 0.5 * (v_n[1:] + v_n[:-1]) * 0.2
+    steps = 0.5 * (v_n[1:] + v_n[:-1]) * leg / 1000.0
     position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
     frame = LocalFrame(0.6, 1.9, 0.0)
     geodetic = np.stack(frame.geodetic(position), axis=1)
+    level = frame.level_from_tangent(*geodetic[:, :2].T)
+    nRb, v_n = level @ nRb, rotate(level, v_n)
     P = np.broadcast_to(1e-4 * np.eye(9), (time.size, 9, 9))
     zero = np.zeros((time.size, 3))
     motion = NavigationMotion(time, geodetic, v_n, nRb, P, zero, zero, np.ones(time.size, bool))
     return motion, (1.0 + scale) * (v_b @ R.T)
 
 
-def test_three_points_find_two_angles_and_the_scale():
+# Along 30 km the vertical turns by 0.3 degrees.
+@pytest.mark.parametrize("leg", [200.0, 5000.0])
+def test_three_points_find_two_angles_and_the_scale(leg):
     turn = exp_so3(np.array([0.0, 0.0, 0.4])) @ exp_so3(np.array([0.05, 0.0, 0.0]))
-    motion, v_d = track(turn, 0.01, np.zeros(3))
+    motion, v_d = track(turn, 0.01, leg=leg)
     outcome = three_points(motion, v_d, MISALIGNMENT, SCALE, np.zeros(3), "RFU")
     assert outcome.converged
     found, scale = outcome.estimated.values
@@ -118,7 +134,7 @@ def test_three_points_find_two_angles_and_the_scale():
 @pytest.mark.parametrize("degrees", [120.0, 175.0, 180.0])
 def test_three_points_find_a_large_turn(degrees, astern):
     turn = exp_so3(np.array([0.0, 0.0, np.radians(degrees)]))
-    motion, v_d = track(turn, 0.01, np.zeros(3))
+    motion, v_d = track(turn, 0.01)
     if astern:
         back = exp_so3(np.array([0.0, 0.0, np.pi]))
         motion, turn = replace(motion, nRb=motion.nRb @ back), turn @ back
@@ -131,21 +147,21 @@ def test_three_points_find_a_large_turn(degrees, astern):
 
 
 def test_three_points_keep_a_misalignment_that_is_known():
-    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01, np.zeros(3))
+    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01)
     known = parameter("misalignment", np.array([0.0, 0.0, 0.3]), np.zeros(3))
     R = three_points(motion, v_d, known, SCALE, np.zeros(3), "RFU").estimated.values[0]
     assert angle(R, exp_so3(np.array([0.0, 0.0, 0.3]))) < 1e-6
 
 
 def test_three_points_are_needed():
-    motion, v_d = track(np.eye(3), 0.0, np.zeros(3))
+    motion, v_d = track(np.eye(3), 0.0)
     few = replace(motion, time=motion.time[:2], nRb=motion.nRb[:2], geodetic=motion.geodetic[:2])
     outcome = three_points(few, v_d[:2], MISALIGNMENT, SCALE, np.zeros(3), "RFU")
     np.testing.assert_array_equal(outcome.estimated.values[0], np.eye(3))
 
 
 def test_three_points_scatter_as_their_positions_say():
-    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01, np.zeros(3))
+    motion, v_d = track(exp_so3(np.array([0.0, 0.0, 0.4])), 0.01)
     motion, v_d = rows_of(motion, slice(None, None, 40)), v_d[::40]
     frame = LocalFrame(0.6, 1.9, 0.0)
     position = frame.position(*motion.geodetic.T)

@@ -8,17 +8,24 @@ import numpy as np
 import pytest
 from findings import of_code
 from planar import STRAIGHT, changed, error_of, trial
+from truth import scenario
 
 from factorgraph_dvl.baselines.single_beacon import filter_planar, run_filter
 from factorgraph_dvl.cli import main
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.estimates import Residuals
 from factorgraph_dvl.files.trial_folder import save_trial
 from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import contradictions
 from factorgraph_dvl.sensors.beacon import Beacons
+from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.trial import InitialPosition
+
+
+def test_a_trial_that_is_not_planar_is_refused():
+    with pytest.raises(ConfigError, match="is not planar"):
+        filter_planar(simulate(scenario()), "4sv-2ob")
 
 
 def test_the_filters_start_from_a_position_only():

@@ -102,10 +102,7 @@ def test_a_changed_tree_is_named(benchmark, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SAMPLED)
-def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark, request):
-    if name == "beams":
-        late = "docs/beams-results.md is of an earlier state: making it anew takes half an hour"
-        request.applymarker(pytest.mark.xfail(reason=late, strict=False))
+def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark):
     module = benchmark(name)
     page = (ROOT / "docs" / module.PAGE).read_text(encoding="utf-8")
     printed = page.splitlines()

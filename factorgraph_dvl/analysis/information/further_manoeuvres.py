@@ -63,7 +63,8 @@ def further_manoeuvres(solution: Solution) -> tuple[FurtherManoeuvre, ...]:
     Parameters
     ----------
     solution : Solution
-        Solution that calibrates a DVL; of any other there is nothing to return.
+        Solution with misalignment, scale error and lever arm of a DVL; of any other there is
+        nothing to return.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def further_manoeuvres(solution: Solution) -> tuple[FurtherManoeuvre, ...]:
         Those that help, the most helpful first.
     """
     own = [e for e in solution.estimates if e.name in _PARAMETERS]
-    if {e.name for e in own} < {MISALIGNMENT, SCALE_ERROR, LEVER_ARM}:
+    if not {MISALIGNMENT, SCALE_ERROR, LEVER_ARM} <= {e.name for e in own}:
         return ()
     order = list(solution.order)
     names = [name for e in own for name in e.component_names]

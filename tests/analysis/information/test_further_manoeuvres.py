@@ -37,6 +37,13 @@ def test_a_calibration_within_its_limits_needs_no_manoeuvre() -> None:
     assert further_manoeuvres(with_std(GOOD, 1e-4, GOOD)) == ()
 
 
+def test_a_method_that_takes_the_lever_arm_as_known_has_none() -> None:
+    solution = with_std(np.ones(3), 1e-4, GOOD)
+    axes = "xyz"
+    bias = estimate("dvl_bias_m_s", tuple(f"dvl_bias_{a}_m_s" for a in axes), GOOD)
+    assert further_manoeuvres(replace(solution, estimates=(*solution.estimates[:2], bias))) == ()
+
+
 def test_turns_determine_the_horizontal_lever_arm_alone() -> None:
     lever_arm = np.array([1.0, 1.0, 1.0])
     found = {m.name: m for m in further_manoeuvres(with_std(GOOD, 1e-4, lever_arm))}
