@@ -36,9 +36,10 @@ _NARROW = 2 * _HALF_WIDTHS[0] + 1
 _REPEATED = 30.0
 _BLOCK = 500
 # Frequency, Hz, above which motion is vibration, half-width of the filter that takes it off, s,
-# and widths that a record must have to show what goes on. Chosen: a ping or a Doppler measurement takes about a tenth of a second, and whether it
-# follows what is faster is not known; no hull sways at 8 Hz. Measured: a propeller of 24 Hz,
-# 1.8 m from the IMU, gave the clock of an INS a minimum every 42 ms.
+# and widths that a record must have to show what goes on. Chosen: a ping or a Doppler measurement
+# takes about a tenth of a second, and whether it follows what is faster is not known; no hull
+# sways at 8 Hz. Measured: a propeller of 24 Hz, 1.8 m from the IMU, gave the clock of an INS a
+# minimum every 42 ms.
 _VIBRATION = 8.0
 _FILTER = 0.5
 _GOES_ON = 10
@@ -73,6 +74,8 @@ class Smoothed:
         Standard deviation of value and derivative from the noise.
     window : int
         Number of samples that each value is made of, 0 where they are left alone.
+    vibrates : bool, default False
+        Whether vibration was taken out of the samples.
     """
 
     spline: BSpline | None
@@ -80,6 +83,7 @@ class Smoothed:
     sigma: float
     slope_sigma: float
     window: int
+    vibrates: bool = False
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return value, derivative and what is not resolved at times, (M, 3) each."""
@@ -105,12 +109,12 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
     """Return the window with the least error of noise and motion together, 0 for none.
 
     What a window takes of a sway that goes on is alike in many measurements, and counts as often.
-    Vibration is an error where it is left: no measurement is known to follow it.
+    So does vibration that it leaves: no measurement is known to follow it.
     """
     few = values[:_ENOUGH]
     vibration = _vibration(few, dt, sigma)
     motion = few if vibration is None else few - vibration
-    best, width = sigma**2 + _power(vibration, dt), 0
+    best, width = sigma**2 + _REPEATED * _power(vibration, dt), 0
     for half in _HALF_WIDTHS:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
@@ -123,7 +127,8 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
         chance = 1.25 * by_noise * np.sqrt(2.0 * window / few.size)
         by_sway = max(float(np.median(_means(moved, _BLOCK))) - by_noise - chance, 0.0)
         left = 0.0 if vibration is None else _power(_filtered(vibration, window), dt)
-        error = by_motion + (_REPEATED - 1.0) * by_sway + left + sigma**2 * kept
+        goes_on = (_REPEATED - 1.0) * by_sway + _REPEATED * left
+        error = by_motion + goes_on + sigma**2 * kept
         if error < best:
             best, width = error, window
     return width
@@ -192,7 +197,9 @@ def smooth(
     width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
-    least = _STEP * sigma * white_gain(_NARROW)
+    # Vibration is no step: if a measurement follows it, its residuals show that.
+    shaking = _power(_vibration(values[:_ENOUGH], dt, sigma), dt) if window is None else 0.0
+    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(shaking)))
     misfit: Array | None
     if values.shape[0] > _SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
@@ -209,6 +216,7 @@ def smooth(
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * slope_gain(width) / dt,
         window=width,
+        vibrates=shaking > 0.0,
     )
 
 
