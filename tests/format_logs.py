@@ -232,6 +232,7 @@ LOG_MESSAGES = {
     ),
     "GPA": (134, "QBCCCCf", "TimeUS,I,VDop,HAcc,VAcc,SAcc,Und"),
     "ATT": (135, "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+    "PARM": (137, "QNff", "TimeUS,Name,Value,Default"),
     "VISO": (136, "Qffffffff", "TimeUS,dt,AngDX,AngDY,AngDZ,PosDX,PosDY,PosDZ,conf"),
 }
 
@@ -476,6 +477,8 @@ def nucleus_track(seconds, velocity, merit=(0.01, 0.02, 0.03), status=0x7FFF, ki
     out = nucleus_body(seconds, 124, 124, status)
     out[24:36] = struct.pack("<3f", 1480.0, 11.0, 10.0)
     out[36:60] = struct.pack("<6f", 0.1, 0.2, 0.3, 10.0, 0.0, 12.0)
+    # Durations of estimates along beams, of which one was not made.
+    out[84:96] = struct.pack("<3f", 0.004, 0.0, 0.006)
     out[96:124] = struct.pack("<7f", *velocity, *merit, 0.02)
     return nucleus_packet(kind, bytes(out))
 

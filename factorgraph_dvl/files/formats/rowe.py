@@ -2,6 +2,9 @@
 
 Source: no document of the maker could be read; the layout is that of the maker's own public
 reader (rowetechinc/rti_python). Velocities are those over ground as the instrument sends them.
+Its times of the first and the last ping are since the first ensemble. In a recording of a boat,
+the first ping of bottom track is 0.20 to 0.22 s behind the stamp of each ensemble, so stamps are
+those of its start.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import binascii
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +28,7 @@ from factorgraph_dvl.files.formats.velocities import (
     INSTRUMENT,
     VELOCITY,
     attitude,
+    averaged,
     empty,
     pings,
     share_of_records,
@@ -40,11 +45,21 @@ _HEADER = 32
 _BAD = 88.888
 # Floats before the first array of bottom track.
 _HEAD = 14
+# Longest time between two pings of an ensemble, s.
+_LONGEST_INTERVAL = 60.0
 _SIZES = {10: 4, 20: 4, 50: 1}
 
 
 # Data sets with the time, bottom track and sentences; a name is at most so long.
 _READ, _LONGEST_NAME = ("E000008", "E000010", "E000011"), 16
+_ERROR = (
+    "the error velocity was scaled so that its spread is that of horizontal velocities: it is a "
+    "quarter of the sum of two beams less that of the others"
+)
+_SHIFT = (
+    "several pings in an ensemble: stamps of velocities were shifted by half of the time from the "
+    "first to the last one"
+)
 
 
 def read_rowe(
@@ -100,7 +115,22 @@ def _stack(
         name: np.concatenate(parts) if parts else np.empty(0, KINDS[name])
         for name, parts in nmea.items()
     }
-    return np.concatenate(pings) if pings else np.empty(0, VELOCITY), joined
+    return _with_error(np.concatenate(pings)) if pings else np.empty(0, VELOCITY), joined
+
+
+def _with_error(found: Records) -> Records:
+    """Scale error velocities so that their σ is that of horizontal velocities.
+
+    With b = ± sin θ X + cos θ Z + e along one pair of beams and - e along the other, σ(e) is half
+    that of a beam, and that of X and Y is √2 / (2 sin θ) of it. sin θ is the ratio of both.
+    """
+    beams, (x, y) = found["beam_velocity"], found["velocity"][:, :2].T
+    across = np.hypot(beams[:, 0] - beams[:, 1], beams[:, 2] - beams[:, 3])
+    use = np.isfinite(across) & np.isfinite(found["error"])
+    speed = np.hypot(x, y)[use]
+    sine = (across[use] @ speed) / (2.0 * (speed @ speed)) if speed.any() else np.nan
+    found["error"] *= np.sqrt(2.0) / sine if 0.0 < sine < 1.0 else np.nan
+    return found
 
 
 def _ensembles(source: Source, losses: Losses) -> Iterator[tuple[int, bytes]]:
@@ -167,6 +197,10 @@ def _bottom_track(content: bytes) -> Records | None:
     for name, index in (("heading", 2), ("pitch", 3), ("roll", 4)):
         ping[name] = values[index] * DEG
     ping["temperature"], ping["depth"], ping["sound_speed"] = values[5], values[9], values[10]
+    first, last, number = values[0], values[1], values[13]
+    interval = (last - first) / (number - 1.0) if number > 1.0 else np.nan
+    if 0.0 < interval < _LONGEST_INTERVAL:
+        ping["delay"], ping["window"] = averaged(number, interval)
     ping["range"][0, :beams] = np.where(arrays[0] > 0.0, arrays[0], np.nan)
     ping["beam_velocity"][0, :beams] = without(arrays[4], _BAD)
     if beams >= 3:
@@ -182,7 +216,9 @@ def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator
         near = None
         if len(velocities):
             near = float(np.nanmedian(velocities["time"]))
-            yield pings(velocities, "own", "", "")
+            batch = pings(velocities, "own", "", "")
+            shifted = (_SHIFT,) if np.isfinite(velocities["delay"]).any() else ()
+            yield replace(batch, notes=(_ERROR, *shifted))
             yield from attitude(velocities, "own")
         yield from sentence_batches(nmea, near, losses)
     yield left_out(losses)

@@ -22,8 +22,7 @@ from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, map_file, numb
 from factorgraph_dvl.files.formats.headed_table import find_header
 from factorgraph_dvl.files.formats.headed_table import rows as table_rows
 from factorgraph_dvl.files.formats.losses import Losses
-from factorgraph_dvl.files.formats.velocities import INSTRUMENT, pings, records
-from factorgraph_dvl.files.formats.water_linked import Row, velocity_of
+from factorgraph_dvl.files.formats.water_linked import Row, batches_of, by_track, velocity_of
 from factorgraph_dvl.geometry.vectors import Array
 
 _NEEDED = frozenset(("time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid"))
@@ -63,16 +62,10 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
         rows.append({**row, "at": at, "second": elapsed})
         if len(rows) >= BLOCK_OF_LINES:
-            yield _batch(rows, note)
+            yield from batches_of(*by_track(rows), note)
             rows = []
-    if rows:
-        yield _batch(rows, note)
+    yield from batches_of(*by_track(rows), note)
     yield left_out(losses)
-
-
-def _batch(rows: list[Row], note: str) -> Batch:
-    found = pings(records(rows, INSTRUMENT), "own", "FRD", "")
-    return Batch("dvl", found.records, "own", axes="FRD", notes=(note,))
 
 
 def _unit_of_stamps(time: Array) -> float | None:
@@ -107,7 +100,10 @@ def _message(names: list[str], cells: list[bytes]) -> dict[str, Any]:
             target = beams.setdefault(index, {"id": index})
         else:
             target = message
-        target[name] = cell.lower() in _TRUE if name.endswith("_valid") else number(cell)
+        if name in ("type", "tracking_mode"):
+            target[name] = cell.decode("latin-1")
+        else:
+            target[name] = cell.lower() in _TRUE if name.endswith("_valid") else number(cell)
     return {**message, "transducers": list(beams.values())}
 
 

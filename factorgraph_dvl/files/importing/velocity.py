@@ -22,8 +22,13 @@ from factorgraph_dvl.sensors.dvl_beams import beam_columns
 
 # Chosen: the least σ that a log is taken to have, and that of one that says nothing, m/s.
 _LEAST_STD, _USUAL_STD = 0.005, 0.02
-# The standard deviation of normal errors is this times their median magnitude.
-_MAD = 1.4826
+# The standard deviation of normal errors is this times their median magnitude, and one in 1.7
+# million of them is larger than this many of it.
+_MAD, _GROSS = 1.4826, 5.0
+_CONTRADICTORY = (
+    "{}: {} of {} pings with an error velocity above 5 σ, half of them from {:.0f} to {:.0f} s "
+    "after the first ping: the beams contradict each other, look for a false bottom lock there"
+)
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,7 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
     directions = beam_geometry(pings) if locked and reference == "bottom" else None
     sample = pings.sample
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
-    std, window = _std(sample, label, decisions), _window(sample, label, decisions)
+    std, window = _std(pings, decisions), _window(sample, label, decisions)
     return Velocities(pings, reference, directions, std, own_std, window, locked, count)
 
 
@@ -179,8 +184,9 @@ def _window(sample: Records, label: str, decisions: Decisions) -> float:
     return window
 
 
-def _std(sample: Records, label: str, decisions: Decisions) -> float:
-    error = sample["error"][np.isfinite(sample["error"])]
+def _std(pings: Merged, decisions: Decisions) -> float:
+    label, known = pings.label, np.isfinite(pings.sample["error"])
+    error = pings.sample["error"][known]
     if len(error):
         # The error velocity is scaled so that its σ is that of the horizontal velocities.
         spread = _MAD * float(np.median(np.abs(error - np.median(error))))
@@ -190,6 +196,11 @@ def _std(sample: Records, label: str, decisions: Decisions) -> float:
             f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s → {value:g}",
             "dvl.velocity_std_m_s",
         )
+        gross = np.abs(error - np.median(error)) > _GROSS * value
+        if gross.any():
+            after = pings.sample_time[known][gross] - pings.sample_time[0]
+            begin, end = np.quantile(after, [0.25, 0.75])
+            decisions.warn(_CONTRADICTORY.format(label, int(gross.sum()), len(error), begin, end))
         return value
     decisions.add(label, "no error velocity → σ chosen as is usual", "dvl.velocity_std_m_s")
     return _USUAL_STD

@@ -318,6 +318,17 @@ def test_ardupilot(tmp_path):
     np.testing.assert_allclose(dvl["delay"], -0.125)
 
 
+def test_ardupilot_says_how_it_turned_movements_before_it_logged_them(tmp_path):
+    needs(ardupilot)
+    settings = [("PARM", 0, b"VISO_TYPE", 1.0, 0.0), ("PARM", 0, b"VISO_ORIENT", 4.0, 0.0)]
+    path = write(tmp_path / "1.BIN", logs.ardupilot_log(settings + logs.ardupilot_trial()))
+    _, _, notes = read(ardupilot, path)
+    assert [note for note in notes if note.startswith("VISO_ORIENT was 4:")]
+    settings[1] = ("PARM", 0, b"VISO_ORIENT", 0.0, 0.0)
+    _, _, notes = read(ardupilot, write(path, logs.ardupilot_log(settings)))
+    assert not [note for note in notes if "VISO_ORIENT" in note]
+
+
 def test_ardupilot_keeps_what_follows_damage(tmp_path):
     needs(ardupilot)
     data = logs.ardupilot_log(logs.ardupilot_trial())
@@ -444,6 +455,7 @@ def test_nucleus(tmp_path):
     np.testing.assert_allclose(dvl["std"][3], (0.01, 0.02, 0.03), rtol=1e-6)
     np.testing.assert_allclose(dvl["range"][3], (10.0, np.nan, 12.0, np.nan))
     np.testing.assert_allclose(dvl["delay"], 0.02, rtol=1e-6)
+    np.testing.assert_allclose(dvl["window"], 0.005, rtol=1e-6)
     attitude = found["attitude", "AHRS"][0]
     np.testing.assert_allclose(
         [attitude[n] / DEG for n in ("roll", "pitch", "heading")], [1.5, -2.5, 270.5]

@@ -13,10 +13,11 @@ from format_writers import nmea
 
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
+from factorgraph_dvl.files.formats.janus import from_beams
 from factorgraph_dvl.files.formats.pd4 import read_pd4
 from factorgraph_dvl.files.formats.pd6 import read_pd6
 from factorgraph_dvl.files.formats.rowe import read_rowe
-from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
+from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP, attitude
 from factorgraph_dvl.files.formats.water_linked import FORMATS as WATER_LINKED
 from factorgraph_dvl.files.formats.water_linked import crc8, read_water_linked
 from factorgraph_dvl.files.formats.water_linked_table import FORMATS as WATER_LINKED_TABLES
@@ -137,7 +138,8 @@ def test_cerulean():
 
 
 def test_water_linked_published_reports():
-    (found, positions) = next(iter(read_water_linked(SERIAL)))
+    found, water, positions, _ = next(iter(read_water_linked(SERIAL)))
+    assert not len(water)
     assert len(found) == 2
     np.testing.assert_allclose(found["velocity"][0], [0.12, -0.4, 2.0])
     np.testing.assert_allclose(found["beam_velocity"][0], [0.07, -0.5, 2.2, 1.8])
@@ -288,12 +290,46 @@ def test_water_linked_json():
     data = b"2021-11-29 " + json.dumps(report).encode() + b"\n"
     data += json.dumps(report | {"velocity_valid": False}).encode() + b"\n{broken\n[1]\n"
     data += json.dumps({"ts": 49056.809, "x": 1.0, "type": "position_local"}).encode()
-    (found, positions) = next(iter(read_water_linked(data)))
+    found, _, positions, _ = next(iter(read_water_linked(data)))
     np.testing.assert_allclose(found["velocity"], [[0.5, -0.25, 0.1], [np.nan] * 3])
     np.testing.assert_allclose(found["beam_velocity"][0], [0.1, np.nan, np.nan, np.nan])
     assert found["time"][0] == pytest.approx(1638191471.563017, abs=1e-6)
     assert found["second"][1] == pytest.approx(0.213)
     assert positions["time"][0] == 49056.809
+
+
+def serial(text):
+    return f"{text}*{crc8(text.encode()):02x}\r\n".encode()
+
+
+def test_water_linked_through_the_water(tmp_path):
+    """Serial protocol 2.7 and json_v3.2: a mode that tracks the water, and the configuration."""
+    covariance = ";".join(["1e-7"] * 9)
+    text = f"0.1,-0.4,2.0,y,0.01,{covariance},7000000,7100000,123.0,0"
+    report = {"time": 500, "vx": 0.5, "vy": 0.2, "vz": 0.1, "fom": 0.02, "velocity_valid": True}
+    config = {"speed_of_sound": 1475.0, "mounting_rotation_offset": 20.0}
+    reply = {"response_to": "get_config", "result": config, "type": "response"}
+    lines = [
+        serial("wrs," + text),
+        serial("wra"),
+        serial("wrc,1475.00,20.00,y,n,auto,y"),
+        json.dumps(report | {"type": "velocity_water"}).encode() + b"\n",
+        json.dumps(report | {"type": "velocity", "tracking_mode": "water"}).encode() + b"\n",
+        json.dumps(reply).encode() + b"\n",
+    ]
+    path = tmp_path / "log.json"
+    path.write_bytes(b"".join(lines))
+    (form,) = recognise(path)
+    batches = list(form.read(path, None))
+    (water,) = (batch for batch in batches if len(batch.records))
+    assert water.kind == "water"
+    np.testing.assert_allclose(water.records["velocity"][0], [0.1, -0.4, 2.0])
+    np.testing.assert_allclose(water.records["time"][0], 7.0)
+    np.testing.assert_allclose(water.records["velocity"][1:], [[0.5, 0.2, 0.1]] * 2)
+    assert water.notes[0].startswith("mounting_rotation_offset was 20° in the DVL")
+    assert batches[-1].losses.skipped == {
+        name: {"type not read": 1} for name in ("wra", "wrc", "response")
+    }
 
 
 def test_crc_of_the_standard_check():
@@ -304,7 +340,7 @@ def test_crc_of_the_standard_check():
     "text", [b"[" * 60000, b'{"vx":' * 9000, b'{"vx":' + b"9" * 6000 + b',"velocity_valid":true}']
 )
 def test_hostile_json_is_passed_over(text):
-    for found, _ in read_water_linked(text):
+    for found, _, _, _ in read_water_linked(text):
         assert not np.isfinite(found["velocity"]).any()
 
 
@@ -325,6 +361,39 @@ def test_rowe():
         [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 181], atol=1e-5
     )
     assert sentences["HDT"]["received"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
+
+
+def test_rowe_means_of_several_pings_and_errors_like_those_of_horizontal_velocities():
+    """The error velocity has σ/2 of a beam, horizontal velocities √2/(2 sin θ) of it."""
+    sine, cosine = np.sin(25.0 * DEG), np.cos(25.0 * DEG)
+    rng = np.random.default_rng(4)
+    x, y, z, e = rng.normal(size=(4, 50))
+    beams = np.array(
+        [sine * x + cosine * z + e, -sine * x + cosine * z + e,
+         sine * y + cosine * z - e, -sine * y + cosine * z - e]
+    )  # fmt: skip
+    data = b"".join(
+        rowe_ensemble(i, beams=beams[:, i], instrument=(x[i], y[i], z[i], e[i]), pings=3.0)
+        for i in range(50)
+    )
+    (found, _) = next(iter(read_rowe(data)))
+    np.testing.assert_allclose(found["error"], from_beams(beams.T, 25.0 * DEG)[:, 3], rtol=1e-5)
+    # Pings at 0, 0.5 and 1 s.
+    np.testing.assert_allclose(found["delay"], 0.5)
+    np.testing.assert_allclose(found["window"], np.sqrt(12.0 * np.var([0.0, 0.5, 1.0])))
+    # Where no ping shows the angle of the beams, nothing is known of errors.
+    (found, _) = next(iter(read_rowe(rowe_ensemble())))
+    assert np.isnan(found["error"]).all()
+    assert np.isnan(found["window"]).all()
+
+
+def test_instruments_without_tilt_sensors_send_zeros():
+    lines = ":SA, +0.00, +0.00,  0.00\n:BI, +500, -600,   +7,  +8,A\n".encode() * 3
+    (found,) = read_pd6(lines)
+    assert not list(attitude(found, "own"))
+    (found,) = read_pd6(lines + b":SA, +0.00, +0.10,  0.00\n:BI, +500, -600,   +7,  +8,A\n")
+    (batch,) = attitude(found, "own")
+    np.testing.assert_array_equal(np.isfinite(batch.records["heading"]), [False] * 3 + [True])
 
 
 def test_pd6_through_the_water(tmp_path):

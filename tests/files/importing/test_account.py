@@ -187,7 +187,7 @@ class TestRecordings:
             "bottom track (dvl)": 0xB4,
             "water track (water)": 0xBE,
             "magnetometer (packet 0x87)": 0x87,
-            "current profile (packet 0xAA)": 0xAA,
+            "altimeter (packet 0xAA)": 0xAA,
         }
         assert {name: sum(found[name]) for name in kinds} == {
             name: counts[kind] for name, kind in kinds.items()

@@ -79,6 +79,23 @@ def test_stamps_move_from_the_start_of_an_average_to_its_middle(tmp_path):
     assert any("0.2 s apart" in line and "by 0.3 s" in line for line in decisions.lines)
 
 
+def test_says_when_the_beams_contradict_each_other(tmp_path):
+    def log(*wrong):
+        errors = (0.5 if i in wrong else 0.01 * (-1) ** i for i in range(60))
+        moments = (WHEN + timedelta(seconds=i) for i in range(60))
+        return b"".join(
+            ping(i, (0.1, -1.5, 0.0, error), when)
+            for i, (error, when) in enumerate(zip(errors, moments, strict=True))
+        )
+
+    _, decisions = imported(tmp_path, log(), fixes())
+    assert not decisions.warnings
+    _, decisions = imported(tmp_path, log(40, 41, 42, 43, 44), fixes(), force=True)
+    (warning,) = decisions.warnings
+    assert "5 of 60 pings with an error velocity above 5 σ" in warning
+    assert "from 41 to 43 s after the first ping" in warning
+
+
 def test_says_that_pings_have_no_time(tmp_path):
     start = WHEN.replace(year=1970)
     unset = b"".join(ping(i, (0.1, -1.5, 0.0, 0.01), start) for i in range(30))
