@@ -388,7 +388,7 @@ def test_rowe_means_of_several_pings_and_errors_like_those_of_horizontal_velocit
 
 
 def test_instruments_without_tilt_sensors_send_zeros():
-    lines = ":SA, +0.00, +0.00,  0.00\n:BI, +500, -600,   +7,  +8,A\n".encode() * 3
+    lines = b":SA, +0.00, +0.00,  0.00\n:BI, +500, -600,   +7,  +8,A\n" * 3
     (found,) = read_pd6(lines)
     assert not list(attitude(found, "own"))
     (found,) = read_pd6(lines + b":SA, +0.00, +0.10,  0.00\n:BI, +500, -600,   +7,  +8,A\n")
