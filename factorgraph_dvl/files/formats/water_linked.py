@@ -18,7 +18,14 @@ from typing import Any
 import numpy as np
 
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out, positive
-from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, lines, map_file, number
+from factorgraph_dvl.files.formats.framing import (
+    BLOCK,
+    LONGEST_LINE,
+    Records,
+    Source,
+    map_file,
+    number,
+)
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.velocities import (
     INSTRUMENT,
@@ -35,8 +42,8 @@ POSITION = np.dtype(
 _SERIAL = re.compile(rb"w(r[a-z?!])(?:,([ -)+-~]{1,400}))?\*([0-9a-f]{2})")
 _UNUSABLE = "too few fields, or no report before it"
 _BRACE = re.compile(rb"[{}]")
-# Bytes of a report on several lines. Chosen: some times what one has.
-_LONGEST_REPORT = 1 << 14
+# Bytes of a report, some times what one has, and how deep its objects are nested.
+_LONGEST_REPORT, _DEEPEST = 1 << 14, 2
 # Fields that a report has at least.
 _FIELDS = {b"rz": 11, b"rs": 10, b"rx": 8, b"ru": 3, b"rp": 9}
 _OFFSET = (
@@ -123,7 +130,7 @@ def _reports(source: Source) -> Iterator[tuple[int, bytes]]:
     next one, whatever became of this one.
     """
     begin, depth, margin, gathered = 0, 0, 0, b""
-    for at, line in lines(source):
+    for at, line in _lines(source):
         if not depth and not line.rstrip().endswith(b"{"):
             yield at, line
             continue
@@ -152,6 +159,41 @@ def _reports(source: Source) -> Iterator[tuple[int, bytes]]:
                 depth = 0
     if depth:
         yield begin, gathered
+
+
+def _lines(source: Source) -> Iterator[tuple[int, bytes]]:
+    """Yield lines, and the objects of an array that stands on one line."""
+    start, size = 0, len(source)
+    while start < size:
+        stop = source.find(b"\n", start)
+        stop = size if stop < 0 else stop
+        closed = source.find(b"}", start, stop)
+        if closed >= 0 and source[start : start + _LONGEST_REPORT].lstrip()[:1] == b"[":
+            yield from _objects(source, start, stop)
+        elif stop - start <= LONGEST_LINE:
+            yield start, source[start:stop].rstrip(b"\r")
+        start = stop + 1
+
+
+def _objects(source: Source, start: int, stop: int) -> Iterator[tuple[int, bytes]]:
+    """Yield the objects between two positions, and what is left of damaged ones."""
+    depth, first = 0, start
+    for begin in range(start, stop, LONGEST_LINE):
+        for brace in _BRACE.finditer(source[begin : min(begin + LONGEST_LINE, stop)]):
+            place = begin + brace.start()
+            is_open = brace[0] == b"{"
+            if depth and ((is_open and depth >= _DEEPEST) or place - first >= _LONGEST_REPORT):
+                yield first, source[first : min(place, first + _LONGEST_REPORT)]
+                depth = 0
+            if is_open:
+                first = first if depth else place
+                depth += 1
+            elif depth:
+                depth -= 1
+                if not depth:
+                    yield first, source[first : place + 1]
+    if depth:
+        yield first, source[first : min(stop, first + _LONGEST_REPORT)]
 
 
 def _crc8_of_byte(value: int) -> int:

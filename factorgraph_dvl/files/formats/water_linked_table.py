@@ -3,7 +3,8 @@
 Programs that log these instruments flatten a report to columns of the same names: `time`, `vx`,
 `vy`, `vz`, `fom`, `altitude`, `velocity_valid`, and `transducers_0_velocity` and so on for beams.
 Units and axes are those of the protocol. `time` is either that of the protocol, the milliseconds
-since the report before, or a stamp: stamps increase from row to row.
+since the report before, or a stamp: stamps increase from row to row. `timestamp` and `log_time`
+are stamps.
 """
 
 from __future__ import annotations
@@ -25,39 +26,48 @@ from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.water_linked import Row, batches_of, by_track, velocity_of
 from factorgraph_dvl.geometry.vectors import Array
 
-_NEEDED = frozenset(("time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid"))
+# Columns of the time, the best first, and all of those of which one is needed.
+_STAMP_COLUMNS = ("timestamp", "log_time", "time")
+_NEEDED = [
+    frozenset((name, "vx", "vy", "vz", "fom", "velocity_valid"))
+    for name in (*_STAMP_COLUMNS, "time_of_validity")
+]
 _BEAM = re.compile(r"transducers?[^0-9A-Za-z]*(\d)[^0-9A-Za-z]+(velocity|distance|beam_valid)")
 _TRUE = (b"true", b"1", b"1.0", b"y", b"yes", b"t")
 # Rows by which `time` is judged.
 _JUDGED = 200
 # Stamps from 1973 on in each unit, the largest first; smaller ones are seconds.
 _UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-_STAMPS = "`time` increases from row to row → stamps in {unit:g} s"
-_STEPS = "`time` does not increase → milliseconds since the row before, as in the protocol"
+_STAMPS = "`{name}` increases from row to row → stamps in {unit:g} s"
+_STEPS = "no stamps that increase → `time` is milliseconds since the row before, by the protocol"
 
 
 def share(path: Path, sample: bytes) -> float:
     """Return whether the first lines of a sample name the columns of such a table."""
-    return float(find_header(sample, _NEEDED) is not None)
+    return float(find_header(sample, *_NEEDED) is not None)
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
     source = map_file(path)
-    header = find_header(source, _NEEDED)
+    header = find_header(source, *_NEEDED)
     if header is None:
         return
     names, losses = header.names, Losses()
-    texts = (line for _, line in islice(table_rows(source, header), _JUDGED))
-    unit = _unit_of_stamps(np.array([_seconds(cells[names.index("time")]) for cells in texts]))
-    note = _STEPS if unit is None else _STAMPS.format(unit=unit)
+    first = [line for _, line in islice(table_rows(source, header), _JUDGED)]
+    column, unit, note = 0, None, _STEPS
+    for name in reversed([name for name in _STAMP_COLUMNS if name in names]):
+        found = _unit_of_stamps(np.array([_seconds(cells[names.index(name)]) for cells in first]))
+        if found is not None:
+            column, unit = names.index(name), found
+            note = _STAMPS.format(name=name, unit=unit)
     rows: list[Row] = []
     elapsed = 0.0
     for at, cells in table_rows(source, header, losses):
         row = velocity_of(_message(names, cells))
         step = row.pop("step")
         if unit is not None:
-            elapsed = row["time"] = _seconds(cells[names.index("time")]) * unit
+            elapsed = row["time"] = _seconds(cells[column]) * unit
         else:
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
         rows.append({**row, "at": at, "second": elapsed})

@@ -11,6 +11,7 @@ import pytest
 from format_samples import PD13, SERIAL, WHEN, rowe_ensemble, stamped_lines
 from format_writers import nmea
 
+from factorgraph_dvl.files.formats import framing, water_linked
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
 from factorgraph_dvl.files.formats.janus import from_beams
@@ -197,6 +198,24 @@ class TestReportsInOneFile:
         path.write_text(json.dumps(reports(30), indent=indent))
         self.same(joined(read_format(WATER_LINKED, path)), self.lines(tmp_path))
 
+    def test_an_array_on_one_line(self, tmp_path, monkeypatch):
+        path = tmp_path / "log.json"
+        path.write_text(json.dumps(reports(300)))
+        expected = self.lines(tmp_path, 300)
+        assert path.stat().st_size > framing.LONGEST_LINE
+        self.same(joined(read_format(WATER_LINKED, path)), expected)
+        # Nothing depends on where its parts end.
+        monkeypatch.setattr(water_linked, "LONGEST_LINE", 997)
+        self.same(joined(read_format(WATER_LINKED, path)), expected)
+        # A report without its end costs itself alone.
+        texts = [json.dumps(report) for report in reports(300)]
+        texts[7] = texts[7][: texts[7].index('"id": 2')]
+        path.write_text("[" + ", ".join(texts))
+        batches = read_format(WATER_LINKED, path)
+        whole = np.delete(expected, 7)
+        np.testing.assert_array_equal(joined(batches)["velocity"], whole["velocity"])
+        assert str(batches[-1].losses).startswith("1 line of damaged JSON, at byte")
+
     def test_a_report_that_was_cut_costs_no_other(self, tmp_path):
         texts = [json.dumps(report, indent=4) for report in reports(30)]
         texts[7] = texts[7][: texts[7].index("distance")]
@@ -253,6 +272,23 @@ class TestReportsInOneFile:
         batches = self.table(tmp_path, [stamp(t) for t in times])
         np.testing.assert_allclose(joined(batches)["time"], times, rtol=0, atol=1e-5)
         assert "stamps" in batches[0].notes[0]
+
+    @pytest.mark.parametrize("name", ["timestamp", "log_time", "time_of_validity"])
+    def test_columns_of_stamps(self, tmp_path, name):
+        """A stamp of the logger is better than the time since the report before."""
+        self.table(tmp_path, [100.0 + i % 7 for i in range(30)])
+        path = tmp_path / "log.csv"
+        head, *rows = path.read_text().splitlines()
+        times = 1638191471.5 + 0.25 * np.arange(30)
+        unit = 1e6 if name == "time_of_validity" else 1.0
+        stamps = [f"{time * unit:.2f}" for time in times]
+        for keep in (head, head.removeprefix("time,")):
+            begin = 0 if keep == head else 1
+            cut = [row.split(",", begin)[-1] for row in rows]
+            lines = (f"{row},{stamp}" for row, stamp in zip(cut, stamps, strict=True))
+            path.write_text("\n".join([f"{keep},{name}", *lines]))
+            found = joined(read_format(WATER_LINKED_TABLES, path))
+            np.testing.assert_allclose(found["time"], times, rtol=0, atol=1e-5)
 
     def test_rows_that_were_cut_are_counted(self, tmp_path):
         self.table(tmp_path)
@@ -407,6 +443,9 @@ def test_pd6_through_the_water(tmp_path):
     np.testing.assert_allclose(batches["dvl"]["velocity"], [[0.5, -0.6, 0.007]] * 3)
     (found,) = read_pd6(b":SA,1,2,3\n:WI,1,2,3,4,V\n", track="W")
     assert np.isnan(found["velocity"]).all()
+    # A line within quotes, as a cell of a table.
+    (found,) = read_pd6(b'7,":SA,1,2,3",\n7,":BI,1000,2000,3,4,A",RESP\n')
+    np.testing.assert_allclose(found["velocity"], [[1.0, 2.0, 0.003]])
 
 
 def test_pd6_with_stamps(tmp_path):
