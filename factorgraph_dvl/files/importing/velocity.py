@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from factorgraph_dvl.files.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.files.importing.positions import best_source
 from factorgraph_dvl.files.importing.speeds import speed_of
 from factorgraph_dvl.files.importing.time_base import Timed
+from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.dvl import STD_COLUMNS, VELOCITY_COLUMNS
 from factorgraph_dvl.sensors.dvl_beams import beam_columns
 
@@ -51,6 +53,8 @@ class Velocities:
         Length over which a ping is a mean; 0 where the instrument does not state it.
     locked, count : int
         Pings with lock, and all.
+    turn : ndarray, shape (3, 3)
+        From the axes of the instrument to those that are written.
     """
 
     pings: Merged
@@ -61,6 +65,12 @@ class Velocities:
     window: float
     locked: int
     count: int
+    turn: Array = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def axes(self) -> BodyAxes | Literal[""]:
+        """Axes of the instrument, empty if they are not known."""
+        return self.pings.streams[0].stream.axes
 
     @property
     def section(self) -> str:
@@ -75,13 +85,27 @@ class Velocities:
                 names = beam_columns(len(self.directions))
                 yield table | {name: part["beams"][:, i] for i, name in enumerate(names)}
                 continue
-            velocity = in_instrument_axes(part)
+            velocity = in_instrument_axes(part) @ self.turn.T
             velocity[np.isnan(velocity).any(axis=1)] = np.nan
             table |= {name: velocity[:, i] for i, name in enumerate(VELOCITY_COLUMNS)}
             if self.own_std:
-                std = np.where(np.isfinite(velocity), part["std"], np.nan)
+                std = np.where(np.isfinite(velocity), part["std"] @ np.abs(self.turn.T), np.nan)
                 table |= {name: std[:, i] for i, name in enumerate(STD_COLUMNS)}
             yield table
+
+
+def named_as(log: Velocities, body: BodyAxes, decisions: Decisions) -> Velocities:
+    """Return pings in axes that are named as those of the body, if the instrument's are known."""
+    if not log.axes or log.axes == body:
+        return log
+    turn = np.asarray(frd_from_body(body).T @ frd_from_body(log.axes))
+    decisions.add(
+        log.pings.label,
+        f"axes {log.axes} of the DVL → {body}, as those of the body: aligned with it, the "
+        "misalignment is zero",
+    )
+    directions = None if log.directions is None else rotate(turn, log.directions)
+    return replace(log, turn=turn, directions=directions)
 
 
 def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:

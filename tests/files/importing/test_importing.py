@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import format_samples as samples
 import format_writers as writers
+import msgspec
 import numpy as np
 import pytest
 
@@ -64,6 +65,19 @@ def imported(tmp_path, *contents, **options):
 def column(out, table, *names):
     found = read_table(out / f"{table}.parquet", names)
     return np.stack([found[name] for name in names], axis=1)
+
+
+def imu_table():
+    rows = (f"{WHEN.timestamp() + 0.1 * i},0,0,0,0,0,9.8" for i in range(300))
+    return "\n".join(["t,gx,gy,gz,ax,ay,az", *rows]).encode()
+
+
+def imu_mapping(axes):
+    names = {"gyro_x": "gx", "gyro_y": "gy", "gyro_z": "gz"}
+    names |= {"accel_x": "ax", "accel_y": "ay", "accel_z": "az"}
+    table = {"file": "file2", "kind": "imu", "axes": axes, "columns": names}
+    table["time"] = {"column": "t", "clock": "utc"}
+    return msgspec.convert({"tables": [table]}, MappingSettings)
 
 
 VELOCITY = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
@@ -257,6 +271,30 @@ class TestAxes:
         velocity = np.linalg.lstsq(directions, beams[0], rcond=None)[0]
         s = np.sin(np.deg2rad(20.0))
         np.testing.assert_allclose(velocity, [-0.1 / s, 0.5 / s, 0.0], atol=1e-6)
+
+    def test_axes_are_named_as_those_of_the_body(self, tmp_path):
+        """Forward 1.5, starboard 0.1, down 0.2 m/s, by a DVL in FRD on bodies of any axes."""
+        names = ("vx", "vy", "vz", "fom", "velocity_valid", "timestamp")
+        cells = ((1.5, 0.1, 0.2, 0.01, 1, WHEN.timestamp() + i) for i in range(30))
+        rows = [names, *cells]
+        log = "\n".join(",".join(map(str, row)) for row in rows).encode()
+        headings = b"".join(
+            writers.nmea(f"GPHDT,{90 + i}.0,T") + fixes(1, WHEN + timedelta(seconds=i))
+            for i in range(30)
+        )
+        # A heading has no axes: the body has those of the DVL.
+        out, _ = imported(tmp_path, log, headings)
+        settings = read_yaml(out / "trial.yaml", dict)
+        assert settings["body_axes"] == "FRD"
+        assert settings["dvl"]["misalignment_std_deg"] == [30.0, 30.0, 180.0]
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [1.5, 0.1, 0.2])
+        files = (log, headings, imu_table())
+        out, decisions = imported(tmp_path, *files, force=True, mapping=imu_mapping("RFU"))
+        assert read_yaml(out / "trial.yaml", dict)["body_axes"] == "RFU"
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [0.1, 1.5, -0.2])
+        assert "axes FRD of the DVL → RFU" in decisions.text("")
+        out, _ = imported(tmp_path, *files, force=True, mapping=imu_mapping("FLU"))
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [1.5, -0.1, -0.2])
 
     def test_lost_pings_are_empty(self, tmp_path):
         bad = ping(99, (None,) * 4, WHEN + timedelta(seconds=40))
