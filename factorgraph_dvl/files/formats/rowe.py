@@ -234,7 +234,7 @@ FORMATS = (
         "Rowe `.ens`",
         share_of_records(read_rowe, _ROWE_BYTES),
         _read_rowe,
-        "a recording of a boat (267 pings), counts by a search for its marks; values not compared",
+        "a recording of a boat (267 pings), counts by a search for its marks; speeds by its GNSS",
         (".ens",),
     ),
 )

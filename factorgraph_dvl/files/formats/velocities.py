@@ -80,8 +80,10 @@ def averaged(count: ArrayLike, interval: ArrayLike) -> tuple[Array, Array]:
 
     Returns
     -------
-    delay, window : ndarray, shape (N,), s
-        From the first ping on; nan where it is the only one.
+    delay : ndarray, shape (N,), s
+        Delay from the first ping; nan where it is the only one.
+    window : ndarray, shape (N,), s
+        Length of the window; nan where there is one ping.
     """
     number, step = np.asarray(count, float), np.asarray(interval, float)
     several = (number > 1.0) & (step > 0.0)

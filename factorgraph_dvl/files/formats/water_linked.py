@@ -290,7 +290,7 @@ def _json_position(message: Row) -> tuple[float, ...]:
 
 
 def _serial_velocity(name: bytes, fields: list[bytes]) -> Row:
-    """Convert `wrz`, or `wrs`, which tells of the water and has no altitude."""
+    """Convert `wrz`, or `wrs`, whose velocity is through the water and which has no altitude."""
     if water := name == b"rs":
         fields = [*fields[:4], b"", *fields[4:]]
     good = fields[3] == b"y"

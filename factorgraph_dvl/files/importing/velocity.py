@@ -14,6 +14,7 @@ from factorgraph_dvl.files.importing.axes import beam_geometry, describe_axes, i
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.files.importing.positions import best_source
+from factorgraph_dvl.files.importing.recognition import by_name
 from factorgraph_dvl.files.importing.speeds import speed_of
 from factorgraph_dvl.files.importing.time_base import Timed
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
@@ -54,7 +55,7 @@ class Velocities:
     locked, count : int
         Pings with lock, and all.
     turn : ndarray, shape (3, 3)
-        From the axes of the instrument to those that are written.
+        Rotation from the axes of the instrument to those that are written.
     """
 
     pings: Merged
@@ -123,6 +124,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
     DataError
         If the files are of several instruments.
     """
+    streams = _without_repetition(streams, decisions)
     _check_one_instrument(streams)
     usable = _usable(streams, decisions)
     for kind, reference in (("dvl", "bottom"), ("water", "water")):
@@ -135,6 +137,21 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
             continue
         return _velocities(pings, reference, locked, decisions)
     return None
+
+
+def _without_repetition(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    """Leave out what a vehicle logged of its DVL where the log of the DVL itself is there."""
+    own = [t.stream for t in streams if t.stream.kind in ("dvl", "water")]
+    logs = [stream for stream in own if by_name(stream.format).family in ("dvl", "table")]
+    out = []
+    for timed in streams:
+        if logs and timed.stream in own and timed.stream not in logs:
+            decisions.add(
+                timed.stream.label, f"left out: it repeats the DVL's own log, {logs[0].file}"
+            )
+        else:
+            out.append(timed)
+    return out
 
 
 def _usable(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:

@@ -24,6 +24,7 @@ from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.importing.account import Account
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.importing.spool import Spool
+from factorgraph_dvl.files.tables import read_table
 
 RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "recordings"
 
@@ -212,6 +213,25 @@ class TestRecordings:
             pattern = rb"\$[A-Z]{2}" + name[:3].encode() + rb",[^$]*?\*[0-9A-F]{2}"
             again = len(re.findall(pattern, repeated))
             assert sum(found[name]) == len(re.findall(pattern, data)) - again
+
+    def test_speeds_of_rowe_are_those_of_its_gnss(self, tmp_path):
+        """On the straight legs, where 1 % is ten times what single pings scatter in their mean."""
+        self.accounted(tmp_path, "rowe_boat_turns.ens")
+        names = ("time_s", "vel_x_m_s", "vel_y_m_s")
+        time, x, y = read_table(tmp_path / "trial" / "dvl.parquet", names).values()
+        stamp, east, north = read_table(
+            tmp_path / "trial" / "gnss.parquet", ("time_s", "vel_e_m_s", "vel_n_m_s")
+        ).values()
+        known = np.isfinite(east)
+        over_ground = np.interp(time, stamp[known], np.hypot(east, north)[known])
+        legs = (over_ground > 1.5) & np.isfinite(x)
+        assert legs.sum() > 80
+        assert np.median(np.hypot(x, y)[legs] / over_ground[legs]) == pytest.approx(1.0, abs=0.01)
+        # The spread of the error velocity, scaled, is that of the velocity across the way.
+        settings = yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text())["dvl"]
+        steps = np.diff(y[legs])[np.diff(time[legs]) < 2.0] / np.sqrt(2.0)
+        assert settings["velocity_std_m_s"] == pytest.approx(np.std(steps), rel=0.25)
+        assert settings["averaging_s"] == pytest.approx(1.1, abs=0.05)
 
     def test_ardupilot(self, tmp_path):
         reader = pytest.importorskip("pymavlink.DFReader")
