@@ -385,6 +385,12 @@ ULOG = {
         "int32_t alt_ellipsoid; float eph; float epv; float s_variance_m_s; float vel_n_m_s; "
         "float vel_e_m_s; float vel_d_m_s; uint8_t fix_type; bool vel_ned_valid"
     ),
+    # As PX4 has positions since 1.14.
+    "sensor_gps": columns(
+        "uint64_t timestamp; uint64_t time_utc_usec; double latitude_deg; double longitude_deg; "
+        "double altitude_msl_m; double altitude_ellipsoid_m; float eph; float epv; "
+        "uint8_t fix_type"
+    ),
     "vehicle_visual_odometry": columns(
         "uint64_t timestamp; uint64_t timestamp_sample; float[3] velocity; "
         "float[3] velocity_variance; uint8_t velocity_frame"
@@ -396,6 +402,7 @@ LETTERS = {
     "int32_t": "i",
     "uint8_t": "B",
     "float": "f",
+    "double": "d",
     "bool": "?",
 }
 

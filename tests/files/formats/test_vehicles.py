@@ -414,6 +414,23 @@ def test_an_imu_that_is_not_there_has_no_values(tmp_path):
     assert np.isnan(found["imu", "RAW_IMU 1:1"]["accel"]).all()
 
 
+def test_what_the_receivers_of_px4_sent_stands_beside_what_was_chosen_of_it(tmp_path):
+    needs(ulog)
+    utc = logs.START * 1_000_000
+    sent = [
+        ("sensor_gps", 0, (5_000_000 + i, utc + i, 54.0, -3.0, 40.25, 87.75, 0.5, 0.9, 3))
+        for i in range(7)
+    ]
+    found, _, _ = read(ulog, write(tmp_path / "log.ulg", logs.ulog(sent)))
+    fix = found["fix", "sensor_gps[0]"]
+    np.testing.assert_allclose(fix["lat"] / DEG, 54.0)
+    np.testing.assert_allclose((fix["altitude"], fix["height"]), [[40.25] * 7, [87.75] * 7])
+    both = write(tmp_path / "log.ulg", logs.ulog(sent + logs.ulog_trial()))
+    (losses,) = (batch.losses for batch in ulog.read(both) if batch.losses)
+    assert losses.skipped == {"sensor_gps": {"repeats another one": 7}}
+    assert ("fix", "sensor_gps[0]") not in read(ulog, both)[0]
+
+
 def test_px4(tmp_path):
     needs(ulog)
     path = write(tmp_path / "log.ulg", logs.ulog(logs.ulog_trial()))
