@@ -2,7 +2,10 @@
 
 Source: no document of the maker could be read; the layout is that of the maker's own public
 reader (rowetechinc/rti_python). Velocities are those over ground as the instrument sends them.
-Its times of the first and the last ping are since the first ensemble. In a recording of a boat,
+Instrument axes are forward, port, up at a roll of 0. So those of an instrument that looks down, at
+a roll of 180°, are forward, starboard, down: in a recording of a boat, they become the Earth
+velocities beside them, to the last digit. What looks up is turned over here, to the same axes. Its
+times of the first and the last ping are since the first ensemble. In a recording of a boat,
 the first ping of bottom track is 0.20 to 0.22 s behind the stamp of each ensemble, so stamps are
 those of its start.
 """
@@ -34,6 +37,7 @@ from factorgraph_dvl.files.formats.velocities import (
     share_of_records,
     without,
 )
+from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.units import DEG
 
 # What an ensemble begins with, its largest size, bytes, and the value of a lost beam: by
@@ -45,6 +49,8 @@ _HEADER = 32
 _BAD = 88.888
 # Floats before the first array of bottom track.
 _HEAD = 14
+# Forward, port, up to forward, starboard, down.
+_OVER = np.array([1.0, -1.0, -1.0])
 # Longest time between two pings of an ensemble, s.
 _LONGEST_INTERVAL = 60.0
 _SIZES = {10: 4, 20: 4, 50: 1}
@@ -80,7 +86,7 @@ def read_rowe(
     ------
     (N,) of `VELOCITY`, those with bottom track, in instrument axes with beams beside; and
     the sentences, as `read_nmea` returns them, `received` at the time of their ensemble.
-    Roll is near 180 degrees when the instrument looks down.
+    Axes are forward, starboard, down, and roll is near 0 when the instrument looks down.
     """
     pings: list[Records] = []
     nmea: dict[str, list[Records]] = {name: [] for name in KINDS}
@@ -194,8 +200,11 @@ def _bottom_track(content: bytes) -> Records | None:
     # Earth axes.
     arrays = values[_HEAD : _HEAD + 10 * beams].reshape(10, beams)
     ping = empty(1, INSTRUMENT if beams >= 3 else BEAM)
-    for name, index in (("heading", 2), ("pitch", 3), ("roll", 4)):
+    for name, index in (("heading", 2), ("pitch", 3)):
         ping[name] = values[index] * DEG
+    roll = values[4] * DEG
+    looks_down = np.cos(roll) < 0.0
+    ping["roll"] = wrapped(roll - np.pi) if looks_down else roll
     ping["temperature"], ping["depth"], ping["sound_speed"] = values[5], values[9], values[10]
     first, last, number = values[0], values[1], values[13]
     interval = (last - first) / (number - 1.0) if number > 1.0 else np.nan
@@ -205,7 +214,7 @@ def _bottom_track(content: bytes) -> Records | None:
     ping["beam_velocity"][0, :beams] = without(arrays[4], _BAD)
     if beams >= 3:
         velocity = without(arrays[6], _BAD)
-        ping["velocity"] = velocity[:3]
+        ping["velocity"] = velocity[:3] * (1.0 if looks_down else _OVER)
         ping["error"] = velocity[3] if beams == 4 else np.nan
     return ping
 
@@ -216,10 +225,10 @@ def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator
         near = None
         if len(velocities):
             near = float(np.nanmedian(velocities["time"]))
-            batch = pings(velocities, "own", "", "")
+            batch = pings(velocities, "own", "FRD", "")
             shifted = (_SHIFT,) if np.isfinite(velocities["delay"]).any() else ()
             yield replace(batch, notes=(_ERROR, *shifted))
-            yield from attitude(velocities, "own")
+            yield from (replace(b, axes="FRD") for b in attitude(velocities, "own"))
         yield from sentence_batches(nmea, near, losses)
     yield left_out(losses)
 
@@ -234,7 +243,8 @@ FORMATS = (
         "Rowe `.ens`",
         share_of_records(read_rowe, _ROWE_BYTES),
         _read_rowe,
-        "a recording of a boat (267 pings), counts by a search for its marks; speeds by its GNSS",
+        "a recording of a boat (267 pings), counts by a search for its marks; axes by its own "
+        "Earth velocities, speeds by its GNSS",
         (".ens",),
     ),
 )

@@ -394,7 +394,7 @@ def test_rowe():
     np.testing.assert_allclose(found["range"][0], [10, np.nan, 11, 12])
     assert found["time"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
     np.testing.assert_allclose(
-        [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 181], atol=1e-5
+        [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 1], atol=1e-5
     )
     assert sentences["HDT"]["received"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
 

@@ -18,6 +18,7 @@ import pytest
 import yaml
 from running import run  # noqa: F401
 
+from factorgraph_dvl.files.formats import rowe
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.format import Batch, empty
 from factorgraph_dvl.files.formats.losses import Losses
@@ -25,6 +26,8 @@ from factorgraph_dvl.files.importing.account import Account
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.tables import read_table
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.vectors import rotate
 
 RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "recordings"
 
@@ -232,6 +235,22 @@ class TestRecordings:
         steps = np.diff(y[legs])[np.diff(time[legs]) < 2.0] / np.sqrt(2.0)
         assert settings["velocity_std_m_s"] == pytest.approx(np.std(steps), rel=0.25)
         assert settings["averaging_s"] == pytest.approx(1.1, abs=0.05)
+
+    def test_axes_of_rowe_are_those_of_its_earth_velocities(self):
+        """Forward, starboard, down, by heading, pitch and roll of the same ping."""
+        path = RECORDINGS / "rowe_boat_turns.ens"
+        if not path.is_file():
+            pytest.skip(f"no recording {path.name}")
+        data = path.read_bytes()
+        (found, _), *_ = rowe.read_rowe(data)
+        known = np.isfinite(found["velocity"]).all(axis=1)
+        rph = np.stack([found[name] for name in ("roll", "pitch", "heading")], axis=1)[known]
+        turned = rotate(rotation_from_rph(rph, "FRD"), found["velocity"][known])
+        # Behind the name: 14 floats, then ten arrays of four, of which the ninth is in Earth axes.
+        starts = [m.end() + 4 * (14 + 8 * 4) for m in re.finditer(b"E000010\0", data)]
+        earth = np.array([np.frombuffer(data[at : at + 12], "<f4") for at in starts])[known]
+        assert len(earth) == 239
+        np.testing.assert_allclose(turned, earth, atol=2e-6)
 
     def test_ardupilot(self, tmp_path):
         reader = pytest.importorskip("pymavlink.DFReader")
