@@ -27,7 +27,6 @@ from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_fi
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Frame, Losses, count_stretch
 from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea, sentence_batches
 from factorgraph_dvl.files.formats.velocities import (
-    BEAM,
     INSTRUMENT,
     VELOCITY,
     attitude,
@@ -102,7 +101,7 @@ def read_rowe(
             ping["at"], ping["time"] = at, time
             pings.append(ping)
         else:
-            losses.skip("ensemble without bottom track", UNKNOWN_TYPE)
+            losses.skip("ensemble without bottom track of three beams", UNKNOWN_TYPE)
         for part in read_nmea(sets.get("E000011", b""), losses=losses):
             for name, records in part.items():
                 records["at"] += at
@@ -190,7 +189,8 @@ def _time(content: bytes) -> float:
 
 def _bottom_track(content: bytes) -> Records | None:
     values = np.frombuffer(content[: len(content) & ~3], "<f4").astype(float)
-    if len(values) < _HEAD or not 1.0 <= values[12] <= 4.0:
+    # A vertical beam has ensembles of its own.
+    if len(values) < _HEAD or not 3.0 <= values[12] <= 4.0:
         return None
     beams = int(values[12])
     if len(values) < _HEAD + 10 * beams:
@@ -199,7 +199,7 @@ def _bottom_track(content: bytes) -> Records | None:
     # Range, SNR, amplitude, correlation, then velocity and count in beam, instrument and
     # Earth axes.
     arrays = values[_HEAD : _HEAD + 10 * beams].reshape(10, beams)
-    ping = empty(1, INSTRUMENT if beams >= 3 else BEAM)
+    ping = empty(1, INSTRUMENT)
     for name, index in (("heading", 2), ("pitch", 3)):
         ping[name] = values[index] * DEG
     roll = values[4] * DEG
@@ -212,10 +212,9 @@ def _bottom_track(content: bytes) -> Records | None:
         ping["delay"], ping["window"] = averaged(number, interval)
     ping["range"][0, :beams] = np.where(arrays[0] > 0.0, arrays[0], np.nan)
     ping["beam_velocity"][0, :beams] = without(arrays[4], _BAD)
-    if beams >= 3:
-        velocity = without(arrays[6], _BAD)
-        ping["velocity"] = velocity[:3] * (1.0 if looks_down else _OVER)
-        ping["error"] = velocity[3] if beams == 4 else np.nan
+    velocity = without(arrays[6], _BAD)
+    ping["velocity"] = velocity[:3] * (1.0 if looks_down else _OVER)
+    ping["error"] = velocity[3] if beams == 4 else np.nan
     return ping
 
 

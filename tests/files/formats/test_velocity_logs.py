@@ -15,6 +15,7 @@ from factorgraph_dvl.files.formats import framing, water_linked
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
 from factorgraph_dvl.files.formats.janus import from_beams
+from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.pd4 import read_pd4
 from factorgraph_dvl.files.formats.pd6 import read_pd6
 from factorgraph_dvl.files.formats.rowe import read_rowe
@@ -421,6 +422,22 @@ def test_rowe_means_of_several_pings_and_errors_like_those_of_horizontal_velocit
     (found, _) = next(iter(read_rowe(rowe_ensemble())))
     assert np.isnan(found["error"]).all()
     assert np.isnan(found["window"]).all()
+
+
+def test_rowe_with_other_numbers_of_beams():
+    """Three beams have no error velocity; a vertical beam has ensembles of its own."""
+
+    def ensemble(beams, number):
+        arrays = [[10.0] * beams, *[[1.0] * beams] * 3, [0.1] * beams, [1.0] * beams]
+        arrays += [[0.5, -0.6, 0.7, 0.01][:beams], [1.0] * beams, [1.0] * beams, [1.0] * beams]
+        return writers.rowe(number, WHEN, [value for part in arrays for value in part])
+
+    losses = Losses()
+    data = ensemble(3, 1) + ensemble(1, 2) + ensemble(4, 3)
+    (found, _) = next(iter(read_rowe(data, losses=losses)))
+    np.testing.assert_allclose(found["velocity"], [[0.5, -0.6, 0.7]] * 2)
+    assert np.isnan(found["error"][0])
+    assert losses.skipped == {"ensemble without bottom track of three beams": {"type not read": 1}}
 
 
 def test_instruments_without_tilt_sensors_send_zeros():
