@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.clocks import seconds_of
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out, positive
 from factorgraph_dvl.files.formats.framing import (
     BLOCK,
@@ -41,7 +42,7 @@ POSITION = np.dtype(
 )
 _SERIAL = re.compile(rb"w(r[a-z?!])(?:,([ -)+-~]{1,400}))?\*([0-9a-f]{2})")
 _UNUSABLE = "too few fields, or no report before it"
-_BRACE = re.compile(rb"[{}]")
+_BRACE, _ARRAY = re.compile(rb"[{}]"), re.compile(rb"\s*\[\s*\{")
 # Bytes of a report, some times what one has, and how deep its objects are nested.
 _LONGEST_REPORT, _DEEPEST = 1 << 14, 2
 # Fields that a report has at least.
@@ -50,6 +51,8 @@ _OFFSET = (
     "mounting_rotation_offset was {:g}° in the DVL: its velocities are turned by it already, and "
     "the misalignment is what is left"
 )
+# Stamps of computers, s: from 2001 to 2096.
+_EARLIEST, _LATEST = 1e9, 4e9
 Row = dict[str, Any]
 
 
@@ -70,8 +73,9 @@ def read_water_linked(
     Yields
     ------
     (N,) and (K,) of `VELOCITY`, over the bottom and through the water, (M,) of `POSITION`, dead
-    reckoning by the DVL itself, m and rad, and what its configuration says. `time`: of validity,
-    nan in old versions, which have `second`, the sum of the times since the report before.
+    reckoning by the DVL itself, m and rad, and what its configuration says. `time`: of validity.
+    Old versions do not have it: then the stamp of a computer before the report, or nan, and
+    `second`, the sum of the times since the report before.
     """
     losses = Losses() if losses is None else losses
     velocities: list[Row] = []
@@ -114,6 +118,8 @@ def read_water_linked(
             else:
                 row = _old_velocity(fields) if name == b"rx" else _serial_velocity(name, fields)
         if row is not None:
+            if not math.isfinite(row.get("time", math.nan)):
+                row["time"] = _received(line[:start])
             step = row.pop("step")
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
             if len(velocities) + len(positions) >= block:
@@ -161,6 +167,12 @@ def _reports(source: Source) -> Iterator[tuple[int, bytes]]:
         yield begin, gathered
 
 
+def _received(before: bytes) -> float:
+    """Return the stamp that a computer wrote before a report, s since 1970, nan without one."""
+    stamp = seconds_of(before.strip(b" \t,;[]()>"))
+    return stamp if _EARLIEST < stamp < _LATEST else math.nan
+
+
 def _lines(source: Source) -> Iterator[tuple[int, bytes]]:
     """Yield lines, and the objects of an array that stands on one line."""
     start, size = 0, len(source)
@@ -168,7 +180,7 @@ def _lines(source: Source) -> Iterator[tuple[int, bytes]]:
         stop = source.find(b"\n", start)
         stop = size if stop < 0 else stop
         closed = source.find(b"}", start, stop)
-        if closed >= 0 and source[start : start + _LONGEST_REPORT].lstrip()[:1] == b"[":
+        if closed >= 0 and _ARRAY.match(source[start : start + _LONGEST_REPORT]):
             yield from _objects(source, start, stop)
         elif stop - start <= LONGEST_LINE:
             yield start, source[start:stop].rstrip(b"\r")

@@ -9,7 +9,6 @@ are stamps.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.clocks import seconds_of
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, map_file, number
 from factorgraph_dvl.files.formats.headed_table import find_header
@@ -57,7 +57,9 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     first = [line for _, line in islice(table_rows(source, header), _JUDGED)]
     column, unit, note = 0, None, _STEPS
     for name in reversed([name for name in _STAMP_COLUMNS if name in names]):
-        found = _unit_of_stamps(np.array([_seconds(cells[names.index(name)]) for cells in first]))
+        found = _unit_of_stamps(
+            np.array([seconds_of(cells[names.index(name)]) for cells in first])
+        )
         if found is not None:
             column, unit = names.index(name), found
             note = _STAMPS.format(name=name, unit=unit)
@@ -67,7 +69,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
         row = velocity_of(_message(names, cells))
         step = row.pop("step")
         if unit is not None:
-            elapsed = row["time"] = _seconds(cells[column]) * unit
+            elapsed = row["time"] = seconds_of(cells[column]) * unit
         else:
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
         rows.append({**row, "at": at, "second": elapsed})
@@ -85,19 +87,6 @@ def _unit_of_stamps(time: Array) -> float | None:
         return None
     size = float(np.median(time))
     return next((unit for least, unit in _UNITS if size >= least), 1.0)
-
-
-def _seconds(cell: bytes) -> float:
-    """Return a number, or the seconds since 1970 of a date and time, taken as UTC."""
-    value = number(cell)
-    if math.isnan(value) and b":" in cell:
-        text = cell.decode("ascii", "replace").replace("/", "-").removesuffix("Z")
-        try:
-            stamp = np.datetime64(text.replace(" ", "T"), "us")
-        except ValueError:
-            return math.nan
-        return math.nan if np.isnat(stamp) else float(stamp.astype(np.int64)) * 1e-6
-    return value
 
 
 def _message(names: list[str], cells: list[bytes]) -> dict[str, Any]:

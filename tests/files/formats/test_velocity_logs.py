@@ -217,6 +217,19 @@ class TestReportsInOneFile:
         np.testing.assert_array_equal(joined(batches)["velocity"], whole["velocity"])
         assert str(batches[-1].losses).startswith("1 line of damaged JSON, at byte")
 
+    @pytest.mark.parametrize("form", ["{:.3f} ", "[{:.3f}] ", "iso", "iso, "])
+    def test_stamps_of_a_computer_before_reports(self, tmp_path, form):
+        times = 1638191471.5 + 0.25 * np.arange(30)
+        lines = []
+        for report, time in zip(reports(30), times, strict=True):
+            iso = str(np.datetime64(round(time * 1e3), "ms"))
+            stamp = form.replace("iso", iso) if "iso" in form else form.format(time)
+            lines.append(stamp + json.dumps(report))
+        path = tmp_path / "log.txt"
+        path.write_text("\n".join(lines))
+        found = joined(read_format(WATER_LINKED, path))
+        np.testing.assert_allclose(found["time"], times, rtol=0, atol=1e-5)
+
     def test_a_report_that_was_cut_costs_no_other(self, tmp_path):
         texts = [json.dumps(report, indent=4) for report in reports(30)]
         texts[7] = texts[7][: texts[7].index("distance")]
