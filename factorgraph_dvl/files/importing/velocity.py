@@ -228,9 +228,10 @@ def _window(sample: Records, label: str, decisions: Decisions) -> float:
 def _std(pings: Merged, decisions: Decisions) -> float:
     label, known = pings.label, np.isfinite(pings.sample["error"])
     error = pings.sample["error"][known]
-    if len(error):
-        # The error velocity is scaled so that its σ is that of the horizontal velocities.
-        spread = _MAD * float(np.median(np.abs(error - np.median(error))))
+    # The error velocity is scaled so that its σ is that of the horizontal velocities. Where most
+    # have one value, as 0, the instrument does not measure it.
+    spread = _MAD * float(np.median(np.abs(error - np.median(error)))) if len(error) else 0.0
+    if spread > 0.0:
         value = max(_LEAST_STD, round(spread, 4))
         decisions.add(
             label,
