@@ -41,6 +41,10 @@ _Record = TypeVar("_Record", bound=Aid | Imu)
 NO_POSITION = (
     "positions: no file has any; give a record of GNSS of the same time, such as NMEA or .pos"
 )
+NO_VELOCITY = (
+    "velocities: no file has any; give the log of the DVL of the same time, such as PD0, AD2CP or "
+    "its reports as JSON"
+)
 NO_LOCK = (
     "velocities: {count} pings, and none of them with bottom lock or a velocity through water"
 )

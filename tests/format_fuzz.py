@@ -125,7 +125,8 @@ def own_files():
         "adcp_raw/vmdas01_wh.ENX",
         "adcp_raw/winriver01.PD0",
     )
-    rowe = (samples.rowe_ensemble(i, writers.nmea("GPHDT,85.5,T")) for i in range(30))
+    heading = writers.nmea("GPHDT,85.5,T")
+    rowe = (samples.rowe_ensemble(i, heading, pings=1.0 + i % 3) for i in range(30))
     return {
         "nmea": [text],
         "underwater-gps": [
@@ -144,9 +145,12 @@ def own_files():
             samples.SERIAL * 20,
             json_lines,
             json.dumps([report] * 30, indent=4).encode(),
+            json.dumps([report] * 30).encode(),
+            # A recording without lock: here it has some.
+            head("recordings/water_linked_a50.json").replace(b'_valid": false', b'_valid": true'),
         ],
         "water-linked-table": [samples.WATER_LINKED_TABLE],
-        "rowe": [b"".join(rowe)],
+        "rowe": [b"".join(rowe), head("recordings/rowe_boat_turns.ens")],
         "sbet": [smooth],
         "smrmsg": [np.ascontiguousarray(samples.deviations(300)).tobytes()],
         "rtklib": [pos],

@@ -232,6 +232,7 @@ LOG_MESSAGES = {
     ),
     "GPA": (134, "QBCCCCf", "TimeUS,I,VDop,HAcc,VAcc,SAcc,Und"),
     "ATT": (135, "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
+    "PARM": (137, "QNff", "TimeUS,Name,Value,Default"),
     "VISO": (136, "Qffffffff", "TimeUS,dt,AngDX,AngDY,AngDZ,PosDX,PosDY,PosDZ,conf"),
 }
 
@@ -384,6 +385,12 @@ ULOG = {
         "int32_t alt_ellipsoid; float eph; float epv; float s_variance_m_s; float vel_n_m_s; "
         "float vel_e_m_s; float vel_d_m_s; uint8_t fix_type; bool vel_ned_valid"
     ),
+    # As PX4 has positions since 1.14.
+    "sensor_gps": columns(
+        "uint64_t timestamp; uint64_t time_utc_usec; double latitude_deg; double longitude_deg; "
+        "double altitude_msl_m; double altitude_ellipsoid_m; float eph; float epv; "
+        "uint8_t fix_type"
+    ),
     "vehicle_visual_odometry": columns(
         "uint64_t timestamp; uint64_t timestamp_sample; float[3] velocity; "
         "float[3] velocity_variance; uint8_t velocity_frame"
@@ -395,6 +402,7 @@ LETTERS = {
     "int32_t": "i",
     "uint8_t": "B",
     "float": "f",
+    "double": "d",
     "bool": "?",
 }
 
@@ -476,6 +484,8 @@ def nucleus_track(seconds, velocity, merit=(0.01, 0.02, 0.03), status=0x7FFF, ki
     out = nucleus_body(seconds, 124, 124, status)
     out[24:36] = struct.pack("<3f", 1480.0, 11.0, 10.0)
     out[36:60] = struct.pack("<6f", 0.1, 0.2, 0.3, 10.0, 0.0, 12.0)
+    # Durations of estimates along beams, of which one was not made.
+    out[84:96] = struct.pack("<3f", 0.004, 0.0, 0.006)
     out[96:124] = struct.pack("<7f", *velocity, *merit, 0.02)
     return nucleus_packet(kind, bytes(out))
 

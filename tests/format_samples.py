@@ -68,17 +68,16 @@ wrz,9.120,-0.400,2.000,y,1.30,1.855,1e-07;0;1.4;0;1.2;0;0.2;0;1e+09,7,14,123.00,
 """
 
 
-def rowe_ensemble(number=1, sentence=b""):
-    ranges, other = [10.0, 0.0, 11.0, 12.0], [1.0] * 12
-    beams, instrument, earth = (
-        [0.1, 88.888, 0.3, 0.4],
-        [0.5, -0.6, 0.7, 0.01],
-        [1.0, 2.0, 3.0, 0.0],
-    )
-    count = [1.0] * 4
-    return writers.rowe(
-        number, WHEN, ranges + other + beams + count + instrument + count + earth + count, sentence
-    )
+def rowe_ensemble(
+    number=1,
+    sentence=b"",
+    beams=(0.1, 88.888, 0.3, 0.4),
+    instrument=(0.5, -0.6, 0.7, 0.01),
+    pings=1.0,
+):
+    ranges, other, count = [10.0, 0.0, 11.0, 12.0], [1.0] * 12, [1.0] * 4
+    bottom = [*ranges, *other, *beams, *count, *instrument, *count, 1.0, 2.0, 3.0, 0.0, *count]
+    return writers.rowe(number, WHEN, bottom, sentence, pings)
 
 
 PD13 = """:SA, +1.50, -2.25,181.02

@@ -194,7 +194,7 @@ def pd4(frame, velocity, ranges, clock, *, long=False, heading=0.0):
     return out + struct.pack("<H", sum(out) % 65536)
 
 
-def rowe(number, when, bottom, sentence=b""):
+def rowe(number, when, bottom, sentence=b"", pings=1.0):
     """Return a Rowe ensemble; `bottom` is what follows the 14 leading floats, by beams."""
 
     def data_set(kind, elements, multiplier, name, content):
@@ -212,7 +212,8 @@ def rowe(number, when, bottom, sentence=b""):
         when.microsecond // 10000,
     )
     ints = struct.pack("<6I7I", number, 30, 4, 1, 1, 0, *clock) + bytes(40)
-    lead = [0.0, 1.0, 123.0, 2.0, 181.0, 11.0, 20.0, 35.0, 1.0, 2.0, 1480.0, 0.0, 4.0, 1.0]
+    lead = [0.0, 1.0, 123.0, 2.0, 181.0, 11.0, 20.0, 35.0, 1.0, 2.0, 1480.0, 0.0]
+    lead += [len(bottom) / 10.0, pings]
     floats = struct.pack(f"<{14 + len(bottom)}f", *lead, *bottom)
     payload = data_set(20, 23, 1, b"E000008", ints) + data_set(
         10, len(floats) // 4, 1, b"E000010", floats

@@ -167,11 +167,12 @@ def _tf(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
 
 
 def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
-    """ArduPilot, parameters of the library AP_VisualOdom.
+    """ArduPilot, parameters of the library AP_VisualOdom, by their descriptions and its source.
 
     VISO_POS: of the sensor from the origin of the body, forward, right, down. VISO_ORIENT: the
-    rotation that takes the sensor's vectors to the body. VISO_SCALE: positions are multiplied by
-    it. VISO_DELAY_MS: by how much the sensor is late.
+    rotation that takes the sensor's vectors to the body (0 forward, 2 right, 4 back, 6 left); the
+    log has what was turned. VISO_SCALE: positions are multiplied by it. VISO_DELAY_MS: taken from
+    the time at which a movement came in; its mean velocity then counts at that time.
     """
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     yield "ArduPilot. VISO_POS from the IMU of the autopilot, forward, right, down, m."
@@ -181,6 +182,8 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
     else:
         nearest = min(_ROTATIONS, key=lambda angle: abs(_turn(yaw, angle)))
         rest = _turn(yaw, nearest)
+        yield "VISO_ORIENT is valid for a trial from VISO of a .BIN only if it was 0 then: the log"
+        yield "has the movements as they were turned. A .tlog has them as they were sent."
         yield Setting(f"VISO_ORIENT,{_ROTATIONS[nearest]}", (i.dvl_in_body["ZYX"].grade[2],))
         yield (
             f"VISO_ORIENT turns by 90 deg only. The rest is yaw {fixed(rest, 2)}, pitch "
@@ -195,6 +198,8 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
     elif not 0.0 <= 1e3 * delay[0] <= _LONGEST_DELAY:
         yield f"VISO_DELAY_MS is 0 to {_LONGEST_DELAY:g}: {fixed(1e3 * delay[0], 0)} is not"
     else:
+        yield "If the trial was made of movements (VISO, VISION_POSITION_DELTA), add half of the"
+        yield "time between two of them to VISO_DELAY_MS: import put their stamps in the middle."
         yield Setting(f"VISO_DELAY_MS,{round(1e3 * delay[0])}", (delay[1],))
 
 
@@ -213,9 +218,10 @@ def _viso_position(i: InstrumentTerms) -> Lines:
 
 
 def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
-    """Water Linked, DVL protocol: `mounting_rotation_offset`, deg, clockwise.
+    """Water Linked, DVL protocol and page Axes: `mounting_rotation_offset`, deg.
 
-    It is the direction of the DVL's forward axis seen from that of the vehicle.
+    It is the clockwise angle about Z from the vehicle's forward axis to that of the DVL; the DVL
+    turns its output back by it. For roll and pitch there is no setting.
     """
     roll, pitch, _ = (float(x) for x in i.as_frd.value)
     if not looks_down(i.attitude_as(WATER_LINKED_AXES)):

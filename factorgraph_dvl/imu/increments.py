@@ -169,8 +169,8 @@ class Increments(ArcPolynomials):
         them.
         """
         omega, alpha = np.empty((2, index.size, 3))
-        # A step leaves high differences, a smooth motion almost none; what the gyro's noise accounts
-        # for is in its own standard deviation already.
+        # A step leaves high differences, a smooth motion almost none; what the gyro's noise
+        # accounts for is in its own standard deviation already.
         rough = np.abs(self.difference_at(index))
         noise = _BEYOND_NOISE * self.difference_sigma
         unresolved = np.sqrt(np.maximum(rough**2 - noise**2, 0.0)) / 4.0

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import format_logs as logs
 import numpy as np
 import pytest
 from calibrations import calibration
@@ -19,6 +20,7 @@ from factorgraph_dvl.cli.options import Target
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.calibration_file import encode_calibration
+from factorgraph_dvl.files.formats.vehicles import telemetry
 from factorgraph_dvl.solution import Calibration
 
 __all__ = ["run"]
@@ -118,6 +120,34 @@ def test_ardupilot_has_the_velocity_of_the_vehicle(alpha: np.ndarray) -> None:
     quarter = np.array([TURNS[int(found["VISO_ORIENT"])](*axis) for axis in np.eye(3)]).T
     turned = quarter @ left.as_matrix() @ quarter.T @ turned
     np.testing.assert_allclose(turned - np.cross(omega, offset), velocity, atol=3e-4)
+
+
+def test_ardupilot_counts_the_delay_from_when_a_movement_came_in(tmp_path: Path) -> None:
+    """`writeBodyFrameOdom`: the mean velocity of a movement counts at its arrival - VISO_DELAY_MS.
+
+    The vehicle gathers speed; each movement is over 0.2 s, and arrives 0.05 s after its end. What
+    import writes is late by 0.05 s, and what ArduPilot subtracts must be half an interval more.
+    """
+    pytest.importorskip("pymavlink")
+    interval, latency, acceleration = 0.2, 0.05, 0.3
+    data = b""
+    for i in range(1, 40):
+        end = 100.0 + interval * i
+        delta = 0.5 * acceleration * (end**2 - (end - interval) ** 2)
+        arrival = logs.START + end + latency
+        values = (0, round(interval * 1e6), 0.0, 0.0, 0.0, delta, 0.0, 0.0, 100.0)
+        data += logs.telemetry("VISION_POSITION_DELTA", arrival, *values)
+    (tmp_path / "a.tlog").write_bytes(data)
+    batches = telemetry.read(tmp_path / "a.tlog")
+    found = np.concatenate([b.records for b in batches if b.kind == "dvl"])
+    stamps = found["time"] + found["delay"] - logs.START
+    ahead = found["velocity"][:, 0]
+    np.testing.assert_allclose(ahead, acceleration * (stamps - latency), rtol=1e-6)
+    counts_at = found["time"] - logs.START - (latency + interval / 2.0)
+    np.testing.assert_allclose(ahead, acceleration * counts_at, rtol=1e-6)
+    text = settings_text(known(ALPHAS[0], late=latency), "ardupilot")
+    assert settings(text)["VISO_DELAY_MS"] == "50"
+    assert "add half of the" in text
 
 
 def test_ardupilot_takes_what_it_has_room_for() -> None:

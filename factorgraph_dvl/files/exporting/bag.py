@@ -157,7 +157,8 @@ class _Messages:
         sigma = record.sigma()
         for row in np.flatnonzero(record.locked).tolist():
             velocity = record.velocity[row]
-            stamp, header = self._header(float(record.time[row]), "dvl")
+            # The axes of a DVL are named as those of the body.
+            stamp, header = self._header(float(record.time[row]), f"dvl_{self._axes}")
             covariance = np.diag(sigma[row] ** 2).ravel()
             speed, course = float(np.hypot(*velocity[:2])), 0.0
             fields = (

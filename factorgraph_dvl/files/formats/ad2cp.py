@@ -22,7 +22,7 @@ from factorgraph_dvl.files.formats.format import Batch, Format, Kind, empty, lef
 from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_file, number
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Frame, Losses, count_stretch
 from factorgraph_dvl.files.formats.nmea import join, read_nmea, sentence_batches
-from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT
+from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, mean_of_known
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -338,6 +338,7 @@ TRACK = np.dtype(
         ("error", "f8"),
         ("merit", "f8", (3,)),
         ("delay", "f8"),
+        ("window", "f8"),
         *((f"beam_{name}", "f8", (4,)) for name in ("velocity", "range", "merit")),
         *((name, "f8") for name in ("sound_speed", "temperature", "pressure")),
     ]
@@ -360,9 +361,10 @@ def tracks(records: Sequence[tuple[int, int, bytes]]) -> Records:
     Returns
     -------
     Records
-        (N,) of `TRACK`: `time` of the trigger, seconds since 1970; `delay` from it to the echo, s;
-        `velocity` X, Y, Z, m/s, Z the mean of two, and `error` half their difference; `merit`, the
-        instrument's own standard deviation, m/s; nan where not measured.
+        (N,) of `TRACK`: `time` of the trigger, seconds since 1970; `delay` from it to the echo and
+        `window`, the duration of the estimate, s; `velocity` X, Y, Z, m/s, Z the mean of two, and
+        `error` half their difference; `merit`, the instrument's own standard deviation, m/s; nan
+        where not measured.
     """
     raw = np.frombuffer(
         b"".join(content[: _RECORD.itemsize] for _, _, content in records), _RECORD
@@ -375,7 +377,9 @@ def tracks(records: Sequence[tuple[int, int, bytes]]) -> Records:
     out["time"] = posix(year + 1900, month + 1, day, hour, minute, second + raw["fraction"] * 1e-4)
     for name in ("sound_speed", "temperature", "pressure"):
         out[name] = _finite(raw[name])
-    velocity, merit, delay = (_finite(raw[name]) for name in ("velocity", "merit", "delay"))
+    velocity, merit, delay, duration = (
+        _finite(raw[name]) for name in ("velocity", "merit", "delay", "duration")
+    )
     velocity[~_valid(raw, "velocity") | (velocity <= _NO_VELOCITY)] = np.nan
     both = np.isfinite(velocity[:, 2:]).all(axis=1)
     vertical = np.where(np.isfinite(velocity[:, 2]), velocity[:, 2], velocity[:, 3])
@@ -384,10 +388,8 @@ def tracks(records: Sequence[tuple[int, int, bytes]]) -> Records:
     out["error"] = (velocity[:, 2] - velocity[:, 3]) / 2.0
     merit[(merit <= 0.0) | (merit >= _NO_MERIT)] = np.nan
     out["merit"] = np.where(np.isfinite(out["velocity"]), merit[:, :3], np.nan)
-    likely = (delay > 0.0) & (delay < _LONGEST_DELAY)
-    number = likely[:, :3].sum(axis=1)
-    total = np.where(likely, delay, 0.0)[:, :3].sum(axis=1)
-    out["delay"] = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    for name, times in (("delay", delay), ("window", duration)):
+        out[name] = mean_of_known(np.where(times < _LONGEST_DELAY, times, np.nan)[:, :3])
     for name in ("velocity", "range", "merit"):
         out[f"beam_{name}"] = _finite(raw[f"beam_{name}"])
     lost = ~_valid(raw, "beam_velocity") | (out["beam_velocity"] <= _NO_VELOCITY)
@@ -484,7 +486,9 @@ def _tracks(tracks: Records) -> Iterator[Batch]:
         if not len(part):
             continue
         out = empty(kind, len(part))
-        for name in ("at", "time", "velocity", "error", "delay", "sound_speed", "temperature"):
+        for name in ("at", "time", "velocity", "error", "delay", "window"):
+            out[name] = part[name]
+        for name in ("sound_speed", "temperature"):
             out[name] = part[name]
         out["received"], out["std"] = part["time"], part["merit"]
         out["beams"], out["range"] = part["beam_velocity"], part["beam_range"]

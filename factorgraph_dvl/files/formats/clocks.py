@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factorgraph_dvl.geometry.units import DAY
+from factorgraph_dvl.files.formats.framing import number
+from factorgraph_dvl.geometry.units import DAY, MICROSECOND
 from factorgraph_dvl.geometry.vectors import Array
 
 # Seconds from 1970 to the start of GPS time, and the days from which GPS time was ahead
@@ -19,6 +22,19 @@ _LEAPS = np.array(
     ],
     dtype="datetime64[s]",
 ).astype(float)
+
+
+def seconds_of(text: bytes) -> float:
+    """Return a number, or the seconds since 1970 of a date and time, taken as UTC; else nan."""
+    value = number(text)
+    if math.isnan(value) and b":" in text:
+        plain = text.decode("ascii", "replace").replace("/", "-").removesuffix("Z")
+        try:
+            stamp = np.datetime64(plain.replace(" ", "T"), "us")
+        except ValueError:
+            return math.nan
+        return math.nan if np.isnat(stamp) else float(stamp.astype(np.int64)) * MICROSECOND
+    return value
 
 
 def full_year(year: ArrayLike) -> NDArray[np.int64]:

@@ -152,7 +152,8 @@ class TableMapping(Section, frozen=True, kw_only=True):
     header_lines: Annotated[int, msgspec.Meta(ge=0, le=1000)] = 1
     invalid: tuple[float, ...] = ()
     valid: ColumnName | None = None
-    axes: BodyAxes = "RFU"
+    # Without: RFU for an IMU; those of a DVL are then not known.
+    axes: BodyAxes | Literal[""] = ""
     coordinates: Literal["beam", "instrument", "ship", "earth"] = "instrument"
     beam_angle_deg: Annotated[float, msgspec.Meta(ge=5, le=45)] | None = None
     # YAML reads `true` without quotation marks as a truth value.

@@ -41,7 +41,7 @@ from factorgraph_dvl.files.formats.framing import (
 from factorgraph_dvl.files.formats.losses import NO_FIX, Losses, count_outside, summed
 from factorgraph_dvl.files.formats.nmea import sentence_batches
 from factorgraph_dvl.files.formats.pd0_navigation import VMDAS, embedded_sentences, vmdas_fixes
-from factorgraph_dvl.files.formats.velocities import BEAM
+from factorgraph_dvl.files.formats.velocities import BEAM, averaged
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
@@ -421,12 +421,8 @@ def _common(pings: Records, times: Array) -> Records:
 
 def _shift(common: Records, pings: Records) -> tuple[str, ...]:
     """Set the delays from stamps to the middle of averages; return what is said about them."""
-    delay = 0.5 * (pings["pings"] - 1) * pings["ping_interval"]
-    common["delay"] = np.where(delay > 0.0, delay, np.nan)
-    # Single pings at intervals i spread as much about their mean as a window of i √(n² - 1).
-    spread = np.sqrt(np.maximum(pings["pings"].astype(float) ** 2 - 1.0, 0.0))
-    common["window"] = np.where(delay > 0.0, spread * pings["ping_interval"], np.nan)
-    stated, first = np.unique(delay, return_index=True)
+    common["delay"], common["window"] = averaged(pings["pings"], pings["ping_interval"])
+    stated, first = np.unique(common["delay"], return_index=True)
     return tuple(
         _SHIFT.format(interval=pings["ping_interval"][place], delay=value)
         for value, place in zip(stated, first, strict=True)

@@ -44,7 +44,7 @@ _AXES = {b"I": INSTRUMENT, b"S": SHIP, b"E": EARTH}
 _FIELDS = {b":SA": 3, b":TS": 5, b":RA": 5}
 _TRACK_FIELDS = {b"I": 5, b"S": 4, b"E": 4, b"D": 5}
 Track = Literal["B", "W"]
-_LINE = re.compile(rb"(:SA|:TS|:RA|:[BW][ISED]),([^:]*)")
+_LINE = re.compile(rb"(:SA|:TS|:RA|:[BW][ISED]),([^:\"]*)")
 _OTHER = re.compile(rb"(:[A-Z]{2}),")
 _BAD = -32768.0
 

@@ -2,6 +2,12 @@
 
 Source: no document of the maker could be read; the layout is that of the maker's own public
 reader (rowetechinc/rti_python). Velocities are those over ground as the instrument sends them.
+Instrument axes are forward, port, up at a roll of 0. So those of an instrument that looks down, at
+a roll of 180°, are forward, starboard, down: in a recording of a boat, they become the Earth
+velocities beside them, to the last digit. What looks up is turned over here, to the same axes. Its
+times of the first and the last ping are since the first ensemble. In a recording of a boat,
+the first ping of bottom track is 0.20 to 0.22 s behind the stamp of each ensemble, so stamps are
+those of its start.
 """
 
 from __future__ import annotations
@@ -9,6 +15,7 @@ from __future__ import annotations
 import binascii
 import struct
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +27,16 @@ from factorgraph_dvl.files.formats.framing import BLOCK, Records, Source, map_fi
 from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Frame, Losses, count_stretch
 from factorgraph_dvl.files.formats.nmea import KINDS, read_nmea, sentence_batches
 from factorgraph_dvl.files.formats.velocities import (
-    BEAM,
     INSTRUMENT,
     VELOCITY,
     attitude,
+    averaged,
     empty,
     pings,
     share_of_records,
     without,
 )
+from factorgraph_dvl.geometry.rotations import wrapped
 from factorgraph_dvl.geometry.units import DEG
 
 # What an ensemble begins with, its largest size, bytes, and the value of a lost beam: by
@@ -40,11 +48,23 @@ _HEADER = 32
 _BAD = 88.888
 # Floats before the first array of bottom track.
 _HEAD = 14
+# Forward, port, up to forward, starboard, down.
+_OVER = np.array([1.0, -1.0, -1.0])
+# Longest time between two pings of an ensemble, s.
+_LONGEST_INTERVAL = 60.0
 _SIZES = {10: 4, 20: 4, 50: 1}
 
 
 # Data sets with the time, bottom track and sentences; a name is at most so long.
 _READ, _LONGEST_NAME = ("E000008", "E000010", "E000011"), 16
+_ERROR = (
+    "the error velocity was scaled so that its spread is that of horizontal velocities: it is a "
+    "quarter of the sum of two beams less that of the others"
+)
+_SHIFT = (
+    "several pings in an ensemble: stamps of velocities were shifted by half of the time from the "
+    "first to the last one"
+)
 
 
 def read_rowe(
@@ -65,7 +85,7 @@ def read_rowe(
     ------
     (N,) of `VELOCITY`, those with bottom track, in instrument axes with beams beside; and
     the sentences, as `read_nmea` returns them, `received` at the time of their ensemble.
-    Roll is near 180 degrees when the instrument looks down.
+    Axes are forward, starboard, down, and roll is near 0 when the instrument looks down.
     """
     pings: list[Records] = []
     nmea: dict[str, list[Records]] = {name: [] for name in KINDS}
@@ -81,7 +101,7 @@ def read_rowe(
             ping["at"], ping["time"] = at, time
             pings.append(ping)
         else:
-            losses.skip("ensemble without bottom track", UNKNOWN_TYPE)
+            losses.skip("ensemble without bottom track of three beams", UNKNOWN_TYPE)
         for part in read_nmea(sets.get("E000011", b""), losses=losses):
             for name, records in part.items():
                 records["at"] += at
@@ -100,7 +120,22 @@ def _stack(
         name: np.concatenate(parts) if parts else np.empty(0, KINDS[name])
         for name, parts in nmea.items()
     }
-    return np.concatenate(pings) if pings else np.empty(0, VELOCITY), joined
+    return _with_error(np.concatenate(pings)) if pings else np.empty(0, VELOCITY), joined
+
+
+def _with_error(found: Records) -> Records:
+    """Scale error velocities so that their σ is that of horizontal velocities.
+
+    With b = ± sin θ X + cos θ Z + e along one pair of beams and - e along the other, σ(e) is half
+    that of a beam, and that of X and Y is √2 / (2 sin θ) of it. sin θ is the ratio of both.
+    """
+    beams, (x, y) = found["beam_velocity"], found["velocity"][:, :2].T
+    across = np.hypot(beams[:, 0] - beams[:, 1], beams[:, 2] - beams[:, 3])
+    use = np.isfinite(across) & np.isfinite(found["error"])
+    speed = np.hypot(x, y)[use]
+    sine = (across[use] @ speed) / (2.0 * (speed @ speed)) if speed.any() else np.nan
+    found["error"] *= np.sqrt(2.0) / sine if 0.0 < sine < 1.0 else np.nan
+    return found
 
 
 def _ensembles(source: Source, losses: Losses) -> Iterator[tuple[int, bytes]]:
@@ -154,7 +189,8 @@ def _time(content: bytes) -> float:
 
 def _bottom_track(content: bytes) -> Records | None:
     values = np.frombuffer(content[: len(content) & ~3], "<f4").astype(float)
-    if len(values) < _HEAD or not 1.0 <= values[12] <= 4.0:
+    # A vertical beam has ensembles of its own.
+    if len(values) < _HEAD or not 3.0 <= values[12] <= 4.0:
         return None
     beams = int(values[12])
     if len(values) < _HEAD + 10 * beams:
@@ -163,16 +199,22 @@ def _bottom_track(content: bytes) -> Records | None:
     # Range, SNR, amplitude, correlation, then velocity and count in beam, instrument and
     # Earth axes.
     arrays = values[_HEAD : _HEAD + 10 * beams].reshape(10, beams)
-    ping = empty(1, INSTRUMENT if beams >= 3 else BEAM)
-    for name, index in (("heading", 2), ("pitch", 3), ("roll", 4)):
+    ping = empty(1, INSTRUMENT)
+    for name, index in (("heading", 2), ("pitch", 3)):
         ping[name] = values[index] * DEG
+    roll = values[4] * DEG
+    looks_down = np.cos(roll) < 0.0
+    ping["roll"] = wrapped(roll - np.pi) if looks_down else roll
     ping["temperature"], ping["depth"], ping["sound_speed"] = values[5], values[9], values[10]
+    first, last, number = values[0], values[1], values[13]
+    interval = (last - first) / (number - 1.0) if number > 1.0 else np.nan
+    if 0.0 < interval < _LONGEST_INTERVAL:
+        ping["delay"], ping["window"] = averaged(number, interval)
     ping["range"][0, :beams] = np.where(arrays[0] > 0.0, arrays[0], np.nan)
     ping["beam_velocity"][0, :beams] = without(arrays[4], _BAD)
-    if beams >= 3:
-        velocity = without(arrays[6], _BAD)
-        ping["velocity"] = velocity[:3]
-        ping["error"] = velocity[3] if beams == 4 else np.nan
+    velocity = without(arrays[6], _BAD)
+    ping["velocity"] = velocity[:3] * (1.0 if looks_down else _OVER)
+    ping["error"] = velocity[3] if beams == 4 else np.nan
     return ping
 
 
@@ -182,8 +224,10 @@ def _read_rowe(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator
         near = None
         if len(velocities):
             near = float(np.nanmedian(velocities["time"]))
-            yield pings(velocities, "own", "", "")
-            yield from attitude(velocities, "own")
+            batch = pings(velocities, "own", "FRD", "")
+            shifted = (_SHIFT,) if np.isfinite(velocities["delay"]).any() else ()
+            yield replace(batch, notes=(_ERROR, *shifted))
+            yield from (replace(b, axes="FRD") for b in attitude(velocities, "own"))
         yield from sentence_batches(nmea, near, losses)
     yield left_out(losses)
 
@@ -198,7 +242,8 @@ FORMATS = (
         "Rowe `.ens`",
         share_of_records(read_rowe, _ROWE_BYTES),
         _read_rowe,
-        "a recording of a boat (267 pings), counts by a search for its marks; values not compared",
+        "a recording of a boat (267 pings), counts by a search for its marks; axes by its own "
+        "Earth velocities, speeds by its GNSS",
         (".ens",),
     ),
 )

@@ -4,7 +4,8 @@ Source: the interface of the Underwater GPS, `position/acoustic/filtered`, `posi
 `position/global`, whose names the columns have, beside those of the sentences GGA and HDT that
 the system at the surface was given. `timestamp` is that of the computer that asked, seconds since
 1970. Places are in metres, x forward and y starboard of the system at the surface, z the depth:
-in a recording with turns of 90°, the track of the vehicle is the smoothest with these axes.
+Water Linked's page on reference frames, of the G2. In a recording with turns of 90°, the track of
+the vehicle is the smoothest with these axes. The first version (Explorer Kit) has y forward.
 """
 
 from __future__ import annotations
@@ -30,7 +31,10 @@ _GGA = ("utc", "latitude", "longitude")
 _ORIENTATION = ("roll", "pitch", "yaw", "state", "progress")
 _TRUE = (b"true", b"1", b"1.0")
 _TIME = "timestamp"
-_AXES = "acoustic places taken as forward, starboard, down of the system at the surface"
+_AXES = (
+    "acoustic places taken as forward, starboard, down of the system at the surface, as those of "
+    "a G2; an Explorer Kit, whose y is forward, is not read"
+)
 _SURFACE_NOTE = (
     "positions with an orientation: those of the system at the surface, not of the vehicle"
 )
@@ -153,7 +157,8 @@ FORMAT = Format(
     share=share,
     read=read,
     verified=(
-        "a recording of a G2 (24 minutes), counts by a script; axes by how smooth the track is"
+        "a recording of a G2 (24 minutes), counts by a script; axes by their document, and by how "
+        "smooth the track is"
     ),
     endings=(".csv",),
 )

@@ -7,20 +7,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from factorgraph_dvl.files.formats.format import Batch, Clock, left_out, positive
 from factorgraph_dvl.files.formats.format import empty as empty_records
 from factorgraph_dvl.files.formats.framing import Records, Source, map_file
 from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array
 
 BEAM, INSTRUMENT, SHIP, EARTH = range(4)
 # One ping. `time`: seconds since 1970, nan if the format has none; `second`: of the day or
 # of the instrument's own count; `velocity`: of the instrument over the bottom, m/s, in `axes`,
 # Earth being east, north, up; `error`: error velocity; `beam_velocity`: as sent; `range`: m, along
 # or below each beam, as the instrument defines it; `altitude` m; `merit`: the instrument's
-# own standard deviation, m/s; angles in rad as sent. What is absent is nan.
+# own standard deviation, m/s; `delay` and `window` as in `format`; angles in rad as sent. What is
+# absent is nan.
 VELOCITY = np.dtype(
     [
         ("at", "i8"),
@@ -35,6 +37,7 @@ VELOCITY = np.dtype(
         ("merit", "f8"),
         *((name, "f8") for name in ("roll", "pitch", "heading")),
         *((name, "f8") for name in ("sound_speed", "temperature", "depth")),
+        *((name, "f8") for name in ("delay", "window")),
     ]
 )
 
@@ -63,6 +66,39 @@ def without(values: NDArray[np.float64], sentinel: float) -> NDArray[np.float64]
     return np.where(np.abs(values - sentinel) < 1e-6, np.nan, values)
 
 
+def averaged(count: ArrayLike, interval: ArrayLike) -> tuple[Array, Array]:
+    """Return the delay to the middle of several pings and the window of their mean, s.
+
+    Single pings at intervals i spread as much about their mean as a window of i √(n² - 1).
+
+    Parameters
+    ----------
+    count : array_like, shape (N,)
+        Number of pings.
+    interval : array_like, shape (N,), s
+        Time between them.
+
+    Returns
+    -------
+    delay : ndarray, shape (N,), s
+        Delay from the first ping; nan where it is the only one.
+    window : ndarray, shape (N,), s
+        Length of the window; nan where there is one ping.
+    """
+    number, step = np.asarray(count, float), np.asarray(interval, float)
+    several = (number > 1.0) & (step > 0.0)
+    number = np.where(several, number, np.nan)
+    return 0.5 * (number - 1.0) * step, np.sqrt(number**2 - 1.0) * step
+
+
+def mean_of_known(values: Array) -> Array:
+    """Return the means (N,) of rows over what is above 0, nan where nothing is."""
+    known = values > 0.0
+    number = known.sum(axis=1)
+    total = np.where(known, values, 0.0).sum(axis=1)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
+
+
 def share_of_records(
     reader: Callable[[Source], Iterator[Any]], size: float
 ) -> Callable[[Path, bytes], float]:
@@ -83,7 +119,7 @@ def pings(found: Records, clock: Clock, axes: BodyAxes | Literal[""], stream: st
     out = empty_records("dvl", len(found))
     for name in ("at", "axes", "velocity", "error", "range", "roll", "pitch", "heading"):
         out[name] = found[name]
-    for name in ("sound_speed", "temperature"):
+    for name in ("sound_speed", "temperature", "delay", "window"):
         out[name] = found[name]
     out["beams"] = found["beam_velocity"]
     has_time = clock in ("utc", "own") and bool(np.isfinite(found["time"]).any())
@@ -95,12 +131,17 @@ def pings(found: Records, clock: Clock, axes: BodyAxes | Literal[""], stream: st
 
 
 def attitude(found: Records, clock: Clock) -> Iterator[Batch]:
-    """Yield the attitudes of pings in common terms, if they have headings."""
-    if not np.isfinite(found["heading"]).any():
+    """Yield the attitudes of pings in common terms, if they have headings.
+
+    Instruments without such sensors send zeros.
+    """
+    there = np.any([found[name] != 0.0 for name in ("roll", "pitch", "heading")], axis=0)
+    if not (np.isfinite(found["heading"]) & there).any():
         return
     out = empty_records("attitude", len(found))
-    for name in ("at", "roll", "pitch", "heading"):
-        out[name] = found[name]
+    out["at"] = found["at"]
+    for name in ("roll", "pitch", "heading"):
+        out[name] = np.where(there, found[name], np.nan)
     time = found["time"] if np.isfinite(found["time"]).any() else found["second"]
     out["time"] = out["received"] = time
     yield Batch("attitude", out, clock, "leader")

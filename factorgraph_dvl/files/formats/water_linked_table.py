@@ -3,12 +3,12 @@
 Programs that log these instruments flatten a report to columns of the same names: `time`, `vx`,
 `vy`, `vz`, `fom`, `altitude`, `velocity_valid`, and `transducers_0_velocity` and so on for beams.
 Units and axes are those of the protocol. `time` is either that of the protocol, the milliseconds
-since the report before, or a stamp: stamps increase from row to row.
+since the report before, or a stamp: stamps increase from row to row. `timestamp` and `log_time`
+are stamps.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -17,62 +17,67 @@ from typing import Any
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.clocks import seconds_of
 from factorgraph_dvl.files.formats.format import Batch, Format, left_out
 from factorgraph_dvl.files.formats.framing import BLOCK_OF_LINES, map_file, number
 from factorgraph_dvl.files.formats.headed_table import find_header
 from factorgraph_dvl.files.formats.headed_table import rows as table_rows
 from factorgraph_dvl.files.formats.losses import Losses
-from factorgraph_dvl.files.formats.velocities import INSTRUMENT, pings, records
-from factorgraph_dvl.files.formats.water_linked import Row, velocity_of
+from factorgraph_dvl.files.formats.water_linked import Row, batches_of, by_track, velocity_of
 from factorgraph_dvl.geometry.vectors import Array
 
-_NEEDED = frozenset(("time", "vx", "vy", "vz", "fom", "altitude", "velocity_valid"))
+# Columns of the time, the best first, and all of those of which one is needed.
+_STAMP_COLUMNS = ("timestamp", "log_time", "time")
+_NEEDED = [
+    frozenset((name, "vx", "vy", "vz", "fom", "velocity_valid"))
+    for name in (*_STAMP_COLUMNS, "time_of_validity")
+]
 _BEAM = re.compile(r"transducers?[^0-9A-Za-z]*(\d)[^0-9A-Za-z]+(velocity|distance|beam_valid)")
 _TRUE = (b"true", b"1", b"1.0", b"y", b"yes", b"t")
 # Rows by which `time` is judged.
 _JUDGED = 200
 # Stamps from 1973 on in each unit, the largest first; smaller ones are seconds.
 _UNITS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3))
-_STAMPS = "`time` increases from row to row → stamps in {unit:g} s"
-_STEPS = "`time` does not increase → milliseconds since the row before, as in the protocol"
+_STAMPS = "`{name}` increases from row to row → stamps in {unit:g} s"
+_STEPS = "no stamps that increase → `time` is milliseconds since the row before, by the protocol"
 
 
 def share(path: Path, sample: bytes) -> float:
     """Return whether the first lines of a sample name the columns of such a table."""
-    return float(find_header(sample, _NEEDED) is not None)
+    return float(find_header(sample, *_NEEDED) is not None)
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
     """Read a file; the parameters and the result are those of `Format.read`."""
     source = map_file(path)
-    header = find_header(source, _NEEDED)
+    header = find_header(source, *_NEEDED)
     if header is None:
         return
     names, losses = header.names, Losses()
-    texts = (line for _, line in islice(table_rows(source, header), _JUDGED))
-    unit = _unit_of_stamps(np.array([_seconds(cells[names.index("time")]) for cells in texts]))
-    note = _STEPS if unit is None else _STAMPS.format(unit=unit)
+    first = [line for _, line in islice(table_rows(source, header), _JUDGED)]
+    column, unit, note = 0, None, _STEPS
+    for name in reversed([name for name in _STAMP_COLUMNS if name in names]):
+        found = _unit_of_stamps(
+            np.array([seconds_of(cells[names.index(name)]) for cells in first])
+        )
+        if found is not None:
+            column, unit = names.index(name), found
+            note = _STAMPS.format(name=name, unit=unit)
     rows: list[Row] = []
     elapsed = 0.0
     for at, cells in table_rows(source, header, losses):
         row = velocity_of(_message(names, cells))
         step = row.pop("step")
         if unit is not None:
-            elapsed = row["time"] = _seconds(cells[names.index("time")]) * unit
+            elapsed = row["time"] = seconds_of(cells[column]) * unit
         else:
             elapsed += step if 0.0 <= step < 3600.0 else 0.0
         rows.append({**row, "at": at, "second": elapsed})
         if len(rows) >= BLOCK_OF_LINES:
-            yield _batch(rows, note)
+            yield from batches_of(*by_track(rows), note)
             rows = []
-    if rows:
-        yield _batch(rows, note)
+    yield from batches_of(*by_track(rows), note)
     yield left_out(losses)
-
-
-def _batch(rows: list[Row], note: str) -> Batch:
-    found = pings(records(rows, INSTRUMENT), "own", "FRD", "")
-    return Batch("dvl", found.records, "own", axes="FRD", notes=(note,))
 
 
 def _unit_of_stamps(time: Array) -> float | None:
@@ -82,19 +87,6 @@ def _unit_of_stamps(time: Array) -> float | None:
         return None
     size = float(np.median(time))
     return next((unit for least, unit in _UNITS if size >= least), 1.0)
-
-
-def _seconds(cell: bytes) -> float:
-    """Return a number, or the seconds since 1970 of a date and time, taken as UTC."""
-    value = number(cell)
-    if math.isnan(value) and b":" in cell:
-        text = cell.decode("ascii", "replace").replace("/", "-").removesuffix("Z")
-        try:
-            stamp = np.datetime64(text.replace(" ", "T"), "us")
-        except ValueError:
-            return math.nan
-        return math.nan if np.isnat(stamp) else float(stamp.astype(np.int64)) * 1e-6
-    return value
 
 
 def _message(names: list[str], cells: list[bytes]) -> dict[str, Any]:
@@ -107,7 +99,10 @@ def _message(names: list[str], cells: list[bytes]) -> dict[str, Any]:
             target = beams.setdefault(index, {"id": index})
         else:
             target = message
-        target[name] = cell.lower() in _TRUE if name.endswith("_valid") else number(cell)
+        if name in ("type", "tracking_mode"):
+            target[name] = cell.decode("latin-1")
+        else:
+            target[name] = cell.lower() in _TRUE if name.endswith("_valid") else number(cell)
     return {**message, "transducers": list(beams.values())}
 
 

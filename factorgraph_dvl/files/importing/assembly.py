@@ -18,13 +18,14 @@ from factorgraph_dvl.files.importing.merging import Merged
 from factorgraph_dvl.files.importing.time_base import FIRST_DATE, Timed
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.yaml_file import dump_yaml
-from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION
+from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION, NO_VELOCITY
 
 Tables = Callable[[float], Iterator[dict[str, Array]]]
 SUFFIX = ".parquet"
 # Chosen: priors of misalignment, deg, and of lever arms, m. Tilt sensors inside a DVL are aligned
-# with its beams to a degree; a compass there may be off by anything.
-_INSIDE, _UNKNOWN_ARM = [1.0, 1.0, 180.0], [10.0, 10.0, 10.0]
+# with its beams to a degree; a compass there may be off by anything. Beams that are 20 to 30° from
+# the axis of a DVL lose the bottom if that is tilted by more than some tens of degrees.
+_INSIDE, _DOWNWARD, _UNKNOWN_ARM = [1.0, 1.0, 180.0], [30.0, 30.0, 180.0], [10.0, 10.0, 10.0]
 # Chosen: biases of logs that come with no data sheet, m/s, on a bed that may move.
 _BIAS = [0.005, 0.005, 0.005]
 # Chosen: clocks that are related by when sentences arrived, without an IMU that would relate them
@@ -112,14 +113,20 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         _add_attitude(out, attitude)
     log = velocity.choose(streams, decisions)
     if log is not None:
+        if not axes and imu is None and ins is None and log.axes:
+            # A heading alone has no axes.
+            out.settings["body_axes"] = log.axes
+        log = velocity.named_as(log, out.settings["body_axes"], decisions)
         _add_log(out, log, attitude)
     depth = motion.choose(streams, "depth", decisions)
     if depth is not None:
         out.add("depth", lambda zero: motion.depth_tables(depth, zero), std_m=0.1)
     if gnss is None and ins is None:
         decisions.lack(NO_POSITION)
-    if log is None or log.locked == 0:
-        decisions.lack(NO_LOCK.format(count=0 if log is None else log.count))
+    if log is None:
+        decisions.lack(NO_VELOCITY)
+    elif log.locked == 0:
+        decisions.lack(NO_LOCK.format(count=log.count))
     if imu is None and ins is None and attitude is None:
         decisions.lack(NO_MOTION)
     return out, epoch
@@ -267,6 +274,14 @@ def _add_log(
             log.pings.label,
             "the attitude sensors are in the DVL → misalignment within a degree; any angle about "
             "the vertical, because it contains the error of the compass",
+            f"{section}.misalignment_std_deg",
+        )
+    elif log.axes and log.reference == "bottom":
+        keys["misalignment_std_deg"] = _DOWNWARD
+        out.decisions.add(
+            log.pings.label,
+            "a DVL with bottom lock looks down → roll and pitch of its mount within some tens of "
+            "degrees; any angle about the vertical",
             f"{section}.misalignment_std_deg",
         )
     else:

@@ -111,7 +111,7 @@ def guess(path: Path) -> str:
     if kind == "imu":
         lines.append(f"    axes: {_axes(columns[:, fields['accel_z'][0]])}")
     if kind == "dvl":
-        lines.append("    axes: RFU  # right, forward, up; or FRD, FLU: not in the table")
+        lines.append("    # axes: FRD  # forward, right, down; or RFU, FLU: not in the table")
     if kind == "ins" and "height" not in fields:
         fields["height"] = fields["altitude"]
     if kind == "attitude" and "true" in names[fields["heading"][0]].lower():

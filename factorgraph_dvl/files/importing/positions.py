@@ -192,7 +192,8 @@ def _describe(fixes: Merged, courses: Merged | None, decisions: Decisions) -> No
     known = np.isfinite(part["std"]).all(axis=1)
     qualities = sorted({int(q) for q in part["quality"][np.isfinite(part["quality"])]})
     source = "stated in the file" if known.any() else "typical of the quality of the fix"
-    text = f"{fixes.count} fixes; standard deviations {source}"
+    count = sum(int(np.isfinite(found["lat"]).sum()) for _, found in fixes.chunks())
+    text = f"{count} fixes; standard deviations {source}"
     if qualities:
         text += f" (quality {', '.join(map(str, qualities))})"
     decisions.add(fixes.label, text, "gnss.file")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from factorgraph_dvl.files.formats.format import (
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.formats.losses import STATUS
 from factorgraph_dvl.files.importing.account import Tally
+from factorgraph_dvl.geometry.rotations import BodyAxes
 
 # Records at a time. Chosen: some MB.
 CHUNK = 50_000
@@ -105,7 +106,7 @@ class Stream:
     kind: Kind
     clock: Clock
     stream: str
-    axes: str
+    axes: BodyAxes | Literal[""]
     heading: HeadingReference
     directions: Directions
     records: Stored
@@ -116,7 +117,7 @@ class Stream:
         return f"{self.file} {self.stream}".rstrip()
 
 
-_Key = tuple[str, str, Kind, Clock, str, str, HeadingReference, Directions]
+_Key = tuple[str, str, Kind, Clock, str, BodyAxes | Literal[""], HeadingReference, Directions]
 
 
 class Spool:

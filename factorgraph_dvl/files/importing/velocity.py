@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,17 +14,24 @@ from factorgraph_dvl.files.importing.axes import beam_geometry, describe_axes, i
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import SAMPLE, Merged, merge
 from factorgraph_dvl.files.importing.positions import best_source
+from factorgraph_dvl.files.importing.recognition import by_name
 from factorgraph_dvl.files.importing.speeds import speed_of
 from factorgraph_dvl.files.importing.time_base import Timed
+from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.sensors.dvl import STD_COLUMNS, VELOCITY_COLUMNS
 from factorgraph_dvl.sensors.dvl_beams import beam_columns
 
 # Chosen: the least σ that a log is taken to have, and that of one that says nothing, m/s.
 _LEAST_STD, _USUAL_STD = 0.005, 0.02
-# The standard deviation of normal errors is this times their median magnitude.
-_MAD = 1.4826
+# The standard deviation of normal errors is this times their median magnitude, and one in 1.7
+# million of them is larger than this many of it.
+_MAD, _GROSS = 1.4826, 5.0
+_CONTRADICTORY = (
+    "{}: {} of {} pings with an error velocity above 5 σ, half of them from {:.0f} to {:.0f} s "
+    "after the first ping: the beams contradict each other, look for a false bottom lock there"
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,8 @@ class Velocities:
         Length over which a ping is a mean; 0 where the instrument does not state it.
     locked, count : int
         Pings with lock, and all.
+    turn : ndarray, shape (3, 3)
+        Rotation from the axes of the instrument to those that are written.
     """
 
     pings: Merged
@@ -56,6 +66,12 @@ class Velocities:
     window: float
     locked: int
     count: int
+    turn: Array = field(default_factory=lambda: np.eye(3))
+
+    @property
+    def axes(self) -> BodyAxes | Literal[""]:
+        """Axes of the instrument, empty if they are not known."""
+        return self.pings.streams[0].stream.axes
 
     @property
     def section(self) -> str:
@@ -70,13 +86,27 @@ class Velocities:
                 names = beam_columns(len(self.directions))
                 yield table | {name: part["beams"][:, i] for i, name in enumerate(names)}
                 continue
-            velocity = in_instrument_axes(part)
+            velocity = in_instrument_axes(part) @ self.turn.T
             velocity[np.isnan(velocity).any(axis=1)] = np.nan
             table |= {name: velocity[:, i] for i, name in enumerate(VELOCITY_COLUMNS)}
             if self.own_std:
-                std = np.where(np.isfinite(velocity), part["std"], np.nan)
+                std = np.where(np.isfinite(velocity), part["std"] @ np.abs(self.turn.T), np.nan)
                 table |= {name: std[:, i] for i, name in enumerate(STD_COLUMNS)}
             yield table
+
+
+def named_as(log: Velocities, body: BodyAxes, decisions: Decisions) -> Velocities:
+    """Return pings in axes that are named as those of the body, if the instrument's are known."""
+    if not log.axes or log.axes == body:
+        return log
+    turn = np.asarray(frd_from_body(body).T @ frd_from_body(log.axes))
+    decisions.add(
+        log.pings.label,
+        f"axes {log.axes} of the DVL → {body}, as those of the body: aligned with it, the "
+        "misalignment is zero",
+    )
+    directions = None if log.directions is None else rotate(turn, log.directions)
+    return replace(log, turn=turn, directions=directions)
 
 
 def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
@@ -94,6 +124,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
     DataError
         If the files are of several instruments.
     """
+    streams = _without_repetition(streams, decisions)
     _check_one_instrument(streams)
     usable = _usable(streams, decisions)
     for kind, reference in (("dvl", "bottom"), ("water", "water")):
@@ -106,6 +137,21 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
             continue
         return _velocities(pings, reference, locked, decisions)
     return None
+
+
+def _without_repetition(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    """Leave out what a vehicle logged of its DVL where the log of the DVL itself is there."""
+    own = [t.stream for t in streams if t.stream.kind in ("dvl", "water")]
+    logs = [stream for stream in own if by_name(stream.format).family in ("dvl", "table")]
+    out = []
+    for timed in streams:
+        if logs and timed.stream in own and timed.stream not in logs:
+            decisions.add(
+                timed.stream.label, f"left out: it repeats the DVL's own log, {logs[0].file}"
+            )
+        else:
+            out.append(timed)
+    return out
 
 
 def _usable(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
@@ -162,7 +208,7 @@ def _velocities(pings: Merged, reference: str, locked: int, decisions: Decisions
     directions = beam_geometry(pings) if locked and reference == "bottom" else None
     sample = pings.sample
     own_std = bool(np.isfinite(sample["std"]).any()) and directions is None
-    std, window = _std(sample, label, decisions), _window(sample, label, decisions)
+    std, window = _std(pings, decisions), _window(sample, label, decisions)
     return Velocities(pings, reference, directions, std, own_std, window, locked, count)
 
 
@@ -179,17 +225,24 @@ def _window(sample: Records, label: str, decisions: Decisions) -> float:
     return window
 
 
-def _std(sample: Records, label: str, decisions: Decisions) -> float:
-    error = sample["error"][np.isfinite(sample["error"])]
-    if len(error):
-        # The error velocity is scaled so that its σ is that of the horizontal velocities.
-        spread = _MAD * float(np.median(np.abs(error - np.median(error))))
+def _std(pings: Merged, decisions: Decisions) -> float:
+    label, known = pings.label, np.isfinite(pings.sample["error"])
+    error = pings.sample["error"][known]
+    # The error velocity is scaled so that its σ is that of the horizontal velocities. Where most
+    # have one value, as 0, the instrument does not measure it.
+    spread = _MAD * float(np.median(np.abs(error - np.median(error)))) if len(error) else 0.0
+    if spread > 0.0:
         value = max(_LEAST_STD, round(spread, 4))
         decisions.add(
             label,
             f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s → {value:g}",
             "dvl.velocity_std_m_s",
         )
+        gross = np.abs(error - np.median(error)) > _GROSS * value
+        if gross.any():
+            after = pings.sample_time[known][gross] - pings.sample_time[0]
+            begin, end = np.quantile(after, [0.25, 0.75])
+            decisions.warn(_CONTRADICTORY.format(label, int(gross.sum()), len(error), begin, end))
         return value
     decisions.add(label, "no error velocity → σ chosen as is usual", "dvl.velocity_std_m_s")
     return _USUAL_STD

@@ -142,6 +142,7 @@ def test_tracks_of_a_dvl(tmp_path):
     np.testing.assert_allclose(whole["range"], [9, 10, 11, 12])
     np.testing.assert_allclose(whole["std"], 0.01, atol=1e-8)
     np.testing.assert_allclose([whole["delay"], whole["sound_speed"]], [0.02, 1490.0], atol=1e-8)
+    np.testing.assert_allclose(whole["window"], 0.005, rtol=1e-6)
     assert whole["time"] == pytest.approx(WHEN.timestamp(), abs=1e-6)
     np.testing.assert_allclose(lost["velocity"], [np.nan, -0.25, 0.3], atol=1e-7)
     np.testing.assert_allclose(lost["beams"], [0.1, np.nan, 0.3, 0.4], atol=1e-7)

@@ -1,7 +1,7 @@
 """Damaged input ends in records or in an error of this package, quickly and in little memory.
 
-`python tests/format_fuzz.py 1539` does the same at length: 20,000 inputs of all readers here, and
-`python tests/format_fuzz.py 500 0 bag` those of a library.
+`python tests/format_fuzz.py 960 41` does the same at length, with all readers here, and
+`python tests/format_fuzz.py 960 41 bag` with that of a library.
 """
 
 from __future__ import annotations

@@ -318,6 +318,17 @@ def test_ardupilot(tmp_path):
     np.testing.assert_allclose(dvl["delay"], -0.125)
 
 
+def test_ardupilot_says_how_it_turned_movements_before_it_logged_them(tmp_path):
+    needs(ardupilot)
+    settings = [("PARM", 0, b"VISO_TYPE", 1.0, 0.0), ("PARM", 0, b"VISO_ORIENT", 4.0, 0.0)]
+    path = write(tmp_path / "1.BIN", logs.ardupilot_log(settings + logs.ardupilot_trial()))
+    _, _, notes = read(ardupilot, path)
+    assert [note for note in notes if note.startswith("VISO_ORIENT was 4:")]
+    settings[1] = ("PARM", 0, b"VISO_ORIENT", 0.0, 0.0)
+    _, _, notes = read(ardupilot, write(path, logs.ardupilot_log(settings)))
+    assert not [note for note in notes if "VISO_ORIENT" in note]
+
+
 def test_ardupilot_keeps_what_follows_damage(tmp_path):
     needs(ardupilot)
     data = logs.ardupilot_log(logs.ardupilot_trial())
@@ -403,6 +414,23 @@ def test_an_imu_that_is_not_there_has_no_values(tmp_path):
     assert np.isnan(found["imu", "RAW_IMU 1:1"]["accel"]).all()
 
 
+def test_what_the_receivers_of_px4_sent_stands_beside_what_was_chosen_of_it(tmp_path):
+    needs(ulog)
+    utc = logs.START * 1_000_000
+    sent = [
+        ("sensor_gps", 0, (5_000_000 + i, utc + i, 54.0, -3.0, 40.25, 87.75, 0.5, 0.9, 3))
+        for i in range(7)
+    ]
+    found, _, _ = read(ulog, write(tmp_path / "log.ulg", logs.ulog(sent)))
+    fix = found["fix", "sensor_gps[0]"]
+    np.testing.assert_allclose(fix["lat"] / DEG, 54.0)
+    np.testing.assert_allclose((fix["altitude"], fix["height"]), [[40.25] * 7, [87.75] * 7])
+    both = write(tmp_path / "log.ulg", logs.ulog(sent + logs.ulog_trial()))
+    (losses,) = (batch.losses for batch in ulog.read(both) if batch.losses)
+    assert losses.skipped == {"sensor_gps": {"repeats another one": 7}}
+    assert ("fix", "sensor_gps[0]") not in read(ulog, both)[0]
+
+
 def test_px4(tmp_path):
     needs(ulog)
     path = write(tmp_path / "log.ulg", logs.ulog(logs.ulog_trial()))
@@ -444,6 +472,7 @@ def test_nucleus(tmp_path):
     np.testing.assert_allclose(dvl["std"][3], (0.01, 0.02, 0.03), rtol=1e-6)
     np.testing.assert_allclose(dvl["range"][3], (10.0, np.nan, 12.0, np.nan))
     np.testing.assert_allclose(dvl["delay"], 0.02, rtol=1e-6)
+    np.testing.assert_allclose(dvl["window"], 0.005, rtol=1e-6)
     attitude = found["attitude", "AHRS"][0]
     np.testing.assert_allclose(
         [attitude[n] / DEG for n in ("roll", "pitch", "heading")], [1.5, -2.5, 270.5]

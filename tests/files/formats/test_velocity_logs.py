@@ -11,12 +11,15 @@ import pytest
 from format_samples import PD13, SERIAL, WHEN, rowe_ensemble, stamped_lines
 from format_writers import nmea
 
+from factorgraph_dvl.files.formats import framing, water_linked
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.dvl_sentences import read_cerulean, read_nortek
+from factorgraph_dvl.files.formats.janus import from_beams
+from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.formats.pd4 import read_pd4
 from factorgraph_dvl.files.formats.pd6 import read_pd6
 from factorgraph_dvl.files.formats.rowe import read_rowe
-from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
+from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP, attitude
 from factorgraph_dvl.files.formats.water_linked import FORMATS as WATER_LINKED
 from factorgraph_dvl.files.formats.water_linked import crc8, read_water_linked
 from factorgraph_dvl.files.formats.water_linked_table import FORMATS as WATER_LINKED_TABLES
@@ -137,7 +140,8 @@ def test_cerulean():
 
 
 def test_water_linked_published_reports():
-    (found, positions) = next(iter(read_water_linked(SERIAL)))
+    found, water, positions, _ = next(iter(read_water_linked(SERIAL)))
+    assert not len(water)
     assert len(found) == 2
     np.testing.assert_allclose(found["velocity"][0], [0.12, -0.4, 2.0])
     np.testing.assert_allclose(found["beam_velocity"][0], [0.07, -0.5, 2.2, 1.8])
@@ -194,6 +198,37 @@ class TestReportsInOneFile:
         self.same(joined(read_format(WATER_LINKED, path)), self.lines(tmp_path))
         path.write_text(json.dumps(reports(30), indent=indent))
         self.same(joined(read_format(WATER_LINKED, path)), self.lines(tmp_path))
+
+    def test_an_array_on_one_line(self, tmp_path, monkeypatch):
+        path = tmp_path / "log.json"
+        path.write_text(json.dumps(reports(300)))
+        expected = self.lines(tmp_path, 300)
+        assert path.stat().st_size > framing.LONGEST_LINE
+        self.same(joined(read_format(WATER_LINKED, path)), expected)
+        # Nothing depends on where its parts end.
+        monkeypatch.setattr(water_linked, "LONGEST_LINE", 997)
+        self.same(joined(read_format(WATER_LINKED, path)), expected)
+        # A report without its end costs itself alone.
+        texts = [json.dumps(report) for report in reports(300)]
+        texts[7] = texts[7][: texts[7].index('"id": 2')]
+        path.write_text("[" + ", ".join(texts))
+        batches = read_format(WATER_LINKED, path)
+        whole = np.delete(expected, 7)
+        np.testing.assert_array_equal(joined(batches)["velocity"], whole["velocity"])
+        assert str(batches[-1].losses).startswith("1 line of damaged JSON, at byte")
+
+    @pytest.mark.parametrize("form", ["{:.3f} ", "[{:.3f}] ", "iso", "iso, "])
+    def test_stamps_of_a_computer_before_reports(self, tmp_path, form):
+        times = 1638191471.5 + 0.25 * np.arange(30)
+        lines = []
+        for report, time in zip(reports(30), times, strict=True):
+            iso = str(np.datetime64(round(time * 1e3), "ms"))
+            stamp = form.replace("iso", iso) if "iso" in form else form.format(time)
+            lines.append(stamp + json.dumps(report))
+        path = tmp_path / "log.txt"
+        path.write_text("\n".join(lines))
+        found = joined(read_format(WATER_LINKED, path))
+        np.testing.assert_allclose(found["time"], times, rtol=0, atol=1e-5)
 
     def test_a_report_that_was_cut_costs_no_other(self, tmp_path):
         texts = [json.dumps(report, indent=4) for report in reports(30)]
@@ -252,6 +287,23 @@ class TestReportsInOneFile:
         np.testing.assert_allclose(joined(batches)["time"], times, rtol=0, atol=1e-5)
         assert "stamps" in batches[0].notes[0]
 
+    @pytest.mark.parametrize("name", ["timestamp", "log_time", "time_of_validity"])
+    def test_columns_of_stamps(self, tmp_path, name):
+        """A stamp of the logger is better than the time since the report before."""
+        self.table(tmp_path, [100.0 + i % 7 for i in range(30)])
+        path = tmp_path / "log.csv"
+        head, *rows = path.read_text().splitlines()
+        times = 1638191471.5 + 0.25 * np.arange(30)
+        unit = 1e6 if name == "time_of_validity" else 1.0
+        stamps = [f"{time * unit:.2f}" for time in times]
+        for keep in (head, head.removeprefix("time,")):
+            begin = 0 if keep == head else 1
+            cut = [row.split(",", begin)[-1] for row in rows]
+            lines = (f"{row},{stamp}" for row, stamp in zip(cut, stamps, strict=True))
+            path.write_text("\n".join([f"{keep},{name}", *lines]))
+            found = joined(read_format(WATER_LINKED_TABLES, path))
+            np.testing.assert_allclose(found["time"], times, rtol=0, atol=1e-5)
+
     def test_rows_that_were_cut_are_counted(self, tmp_path):
         self.table(tmp_path)
         path = tmp_path / "log.csv"
@@ -288,12 +340,46 @@ def test_water_linked_json():
     data = b"2021-11-29 " + json.dumps(report).encode() + b"\n"
     data += json.dumps(report | {"velocity_valid": False}).encode() + b"\n{broken\n[1]\n"
     data += json.dumps({"ts": 49056.809, "x": 1.0, "type": "position_local"}).encode()
-    (found, positions) = next(iter(read_water_linked(data)))
+    found, _, positions, _ = next(iter(read_water_linked(data)))
     np.testing.assert_allclose(found["velocity"], [[0.5, -0.25, 0.1], [np.nan] * 3])
     np.testing.assert_allclose(found["beam_velocity"][0], [0.1, np.nan, np.nan, np.nan])
     assert found["time"][0] == pytest.approx(1638191471.563017, abs=1e-6)
     assert found["second"][1] == pytest.approx(0.213)
     assert positions["time"][0] == 49056.809
+
+
+def serial(text):
+    return f"{text}*{crc8(text.encode()):02x}\r\n".encode()
+
+
+def test_water_linked_through_the_water(tmp_path):
+    """Serial protocol 2.7 and json_v3.2: a mode that tracks the water, and the configuration."""
+    covariance = ";".join(["1e-7"] * 9)
+    text = f"0.1,-0.4,2.0,y,0.01,{covariance},7000000,7100000,123.0,0"
+    report = {"time": 500, "vx": 0.5, "vy": 0.2, "vz": 0.1, "fom": 0.02, "velocity_valid": True}
+    config = {"speed_of_sound": 1475.0, "mounting_rotation_offset": 20.0}
+    reply = {"response_to": "get_config", "result": config, "type": "response"}
+    lines = [
+        serial("wrs," + text),
+        serial("wra"),
+        serial("wrc,1475.00,20.00,y,n,auto,y"),
+        json.dumps(report | {"type": "velocity_water"}).encode() + b"\n",
+        json.dumps(report | {"type": "velocity", "tracking_mode": "water"}).encode() + b"\n",
+        json.dumps(reply).encode() + b"\n",
+    ]
+    path = tmp_path / "log.json"
+    path.write_bytes(b"".join(lines))
+    (form,) = recognise(path)
+    batches = list(form.read(path, None))
+    (water,) = (batch for batch in batches if len(batch.records))
+    assert water.kind == "water"
+    np.testing.assert_allclose(water.records["velocity"][0], [0.1, -0.4, 2.0])
+    np.testing.assert_allclose(water.records["time"][0], 7.0)
+    np.testing.assert_allclose(water.records["velocity"][1:], [[0.5, 0.2, 0.1]] * 2)
+    assert water.notes[0].startswith("mounting_rotation_offset was 20° in the DVL")
+    assert batches[-1].losses.skipped == {
+        name: {"type not read": 1} for name in ("wra", "wrc", "response")
+    }
 
 
 def test_crc_of_the_standard_check():
@@ -304,7 +390,7 @@ def test_crc_of_the_standard_check():
     "text", [b"[" * 60000, b'{"vx":' * 9000, b'{"vx":' + b"9" * 6000 + b',"velocity_valid":true}']
 )
 def test_hostile_json_is_passed_over(text):
-    for found, _ in read_water_linked(text):
+    for found, _, _, _ in read_water_linked(text):
         assert not np.isfinite(found["velocity"]).any()
 
 
@@ -322,9 +408,58 @@ def test_rowe():
     np.testing.assert_allclose(found["range"][0], [10, np.nan, 11, 12])
     assert found["time"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
     np.testing.assert_allclose(
-        [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 181], atol=1e-5
+        [found[n][0] / DEG for n in ("heading", "pitch", "roll")], [123, 2, 1], atol=1e-5
     )
     assert sentences["HDT"]["received"][0] == pytest.approx(WHEN.timestamp(), abs=1e-6)
+
+
+def test_rowe_means_of_several_pings_and_errors_like_those_of_horizontal_velocities():
+    """The error velocity has σ/2 of a beam, horizontal velocities √2/(2 sin θ) of it."""
+    sine, cosine = np.sin(25.0 * DEG), np.cos(25.0 * DEG)
+    rng = np.random.default_rng(4)
+    x, y, z, e = rng.normal(size=(4, 50))
+    beams = np.array(
+        [sine * x + cosine * z + e, -sine * x + cosine * z + e,
+         sine * y + cosine * z - e, -sine * y + cosine * z - e]
+    )  # fmt: skip
+    data = b"".join(
+        rowe_ensemble(i, beams=beams[:, i], instrument=(x[i], y[i], z[i], e[i]), pings=3.0)
+        for i in range(50)
+    )
+    (found, _) = next(iter(read_rowe(data)))
+    np.testing.assert_allclose(found["error"], from_beams(beams.T, 25.0 * DEG)[:, 3], rtol=1e-5)
+    # Pings at 0, 0.5 and 1 s.
+    np.testing.assert_allclose(found["delay"], 0.5)
+    np.testing.assert_allclose(found["window"], np.sqrt(12.0 * np.var([0.0, 0.5, 1.0])))
+    # Where no ping shows the angle of the beams, nothing is known of errors.
+    (found, _) = next(iter(read_rowe(rowe_ensemble())))
+    assert np.isnan(found["error"]).all()
+    assert np.isnan(found["window"]).all()
+
+
+def test_rowe_with_other_numbers_of_beams():
+    """Three beams have no error velocity; a vertical beam has ensembles of its own."""
+
+    def ensemble(beams, number):
+        arrays = [[10.0] * beams, *[[1.0] * beams] * 3, [0.1] * beams, [1.0] * beams]
+        arrays += [[0.5, -0.6, 0.7, 0.01][:beams], [1.0] * beams, [1.0] * beams, [1.0] * beams]
+        return writers.rowe(number, WHEN, [value for part in arrays for value in part])
+
+    losses = Losses()
+    data = ensemble(3, 1) + ensemble(1, 2) + ensemble(4, 3)
+    (found, _) = next(iter(read_rowe(data, losses=losses)))
+    np.testing.assert_allclose(found["velocity"], [[0.5, -0.6, 0.7]] * 2)
+    assert np.isnan(found["error"][0])
+    assert losses.skipped == {"ensemble without bottom track of three beams": {"type not read": 1}}
+
+
+def test_instruments_without_tilt_sensors_send_zeros():
+    lines = b":SA, +0.00, +0.00,  0.00\n:BI, +500, -600,   +7,  +8,A\n" * 3
+    (found,) = read_pd6(lines)
+    assert not list(attitude(found, "own"))
+    (found,) = read_pd6(lines + b":SA, +0.00, +0.10,  0.00\n:BI, +500, -600,   +7,  +8,A\n")
+    (batch,) = attitude(found, "own")
+    np.testing.assert_array_equal(np.isfinite(batch.records["heading"]), [False] * 3 + [True])
 
 
 def test_pd6_through_the_water(tmp_path):
@@ -338,6 +473,9 @@ def test_pd6_through_the_water(tmp_path):
     np.testing.assert_allclose(batches["dvl"]["velocity"], [[0.5, -0.6, 0.007]] * 3)
     (found,) = read_pd6(b":SA,1,2,3\n:WI,1,2,3,4,V\n", track="W")
     assert np.isnan(found["velocity"]).all()
+    # A line within quotes, as a cell of a table.
+    (found,) = read_pd6(b'7,":SA,1,2,3",\n7,":BI,1000,2000,3,4,A",RESP\n')
+    np.testing.assert_allclose(found["velocity"], [[1.0, 2.0, 0.003]])
 
 
 def test_pd6_with_stamps(tmp_path):

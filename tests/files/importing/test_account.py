@@ -18,12 +18,16 @@ import pytest
 import yaml
 from running import run  # noqa: F401
 
+from factorgraph_dvl.files.formats import rowe
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.format import Batch, empty
 from factorgraph_dvl.files.formats.losses import Losses
 from factorgraph_dvl.files.importing.account import Account
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.importing.spool import Spool
+from factorgraph_dvl.files.tables import read_table
+from factorgraph_dvl.geometry.rotations import rotation_from_rph
+from factorgraph_dvl.geometry.vectors import rotate
 
 RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "recordings"
 
@@ -187,7 +191,7 @@ class TestRecordings:
             "bottom track (dvl)": 0xB4,
             "water track (water)": 0xBE,
             "magnetometer (packet 0x87)": 0x87,
-            "current profile (packet 0xAA)": 0xAA,
+            "altimeter (packet 0xAA)": 0xAA,
         }
         assert {name: sum(found[name]) for name in kinds} == {
             name: counts[kind] for name, kind in kinds.items()
@@ -212,6 +216,41 @@ class TestRecordings:
             pattern = rb"\$[A-Z]{2}" + name[:3].encode() + rb",[^$]*?\*[0-9A-F]{2}"
             again = len(re.findall(pattern, repeated))
             assert sum(found[name]) == len(re.findall(pattern, data)) - again
+
+    def test_speeds_of_rowe_are_those_of_its_gnss(self, tmp_path):
+        """On the straight legs, where 1 % is ten times what single pings scatter in their mean."""
+        self.accounted(tmp_path, "rowe_boat_turns.ens")
+        names = ("time_s", "vel_x_m_s", "vel_y_m_s")
+        time, x, y = read_table(tmp_path / "trial" / "dvl.parquet", names).values()
+        stamp, east, north = read_table(
+            tmp_path / "trial" / "gnss.parquet", ("time_s", "vel_e_m_s", "vel_n_m_s")
+        ).values()
+        known = np.isfinite(east)
+        over_ground = np.interp(time, stamp[known], np.hypot(east, north)[known])
+        legs = (over_ground > 1.5) & np.isfinite(x)
+        assert legs.sum() > 80
+        assert np.median(np.hypot(x, y)[legs] / over_ground[legs]) == pytest.approx(1.0, abs=0.01)
+        # The spread of the error velocity, scaled, is that of the velocity across the way.
+        settings = yaml.safe_load((tmp_path / "trial" / "trial.yaml").read_text())["dvl"]
+        steps = np.diff(y[legs])[np.diff(time[legs]) < 2.0] / np.sqrt(2.0)
+        assert settings["velocity_std_m_s"] == pytest.approx(np.std(steps), rel=0.25)
+        assert settings["averaging_s"] == pytest.approx(1.1, abs=0.05)
+
+    def test_axes_of_rowe_are_those_of_its_earth_velocities(self):
+        """Forward, starboard, down, by heading, pitch and roll of the same ping."""
+        path = RECORDINGS / "rowe_boat_turns.ens"
+        if not path.is_file():
+            pytest.skip(f"no recording {path.name}")
+        data = path.read_bytes()
+        (found, _), *_ = rowe.read_rowe(data)
+        known = np.isfinite(found["velocity"]).all(axis=1)
+        rph = np.stack([found[name] for name in ("roll", "pitch", "heading")], axis=1)[known]
+        turned = rotate(rotation_from_rph(rph, "FRD"), found["velocity"][known])
+        # Behind the name: 14 floats, then ten arrays of four, of which the ninth is in Earth axes.
+        starts = [m.end() + 4 * (14 + 8 * 4) for m in re.finditer(b"E000010\0", data)]
+        earth = np.array([np.frombuffer(data[at : at + 12], "<f4") for at in starts])[known]
+        assert len(earth) == 239
+        np.testing.assert_allclose(turned, earth, atol=2e-6)
 
     def test_ardupilot(self, tmp_path):
         reader = pytest.importorskip("pymavlink.DFReader")
@@ -295,9 +334,9 @@ class TestRecordings:
             ("nucleus_at_rest.nucleus", ["positions", "velocities: 266 pings, and none"]),
             ("water_linked_a50.json", ["positions", "velocities: 232 pings", "attitude"]),
             ("h1000_pd6_pool.csv.gz", ["positions"]),
-            ("ardusub_small.BIN", ["positions", "velocities: 0 pings"]),
-            ("ardusub_small.tlog", ["velocities: 0 pings"]),
-            ("px4_small.ulg", ["velocities: 0 pings"]),
+            ("ardusub_small.BIN", ["positions", "velocities: no file has any"]),
+            ("ardusub_small.tlog", ["velocities: no file has any"]),
+            ("px4_small.ulg", ["velocities: no file has any"]),
             ("rowe_boat_turns.ens", []),
         ],
     )

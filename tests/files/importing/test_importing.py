@@ -7,6 +7,7 @@ from datetime import UTC, datetime, timedelta
 
 import format_samples as samples
 import format_writers as writers
+import msgspec
 import numpy as np
 import pytest
 
@@ -66,6 +67,19 @@ def column(out, table, *names):
     return np.stack([found[name] for name in names], axis=1)
 
 
+def imu_table():
+    rows = (f"{WHEN.timestamp() + 0.1 * i},0,0,0,0,0,9.8" for i in range(300))
+    return "\n".join(["t,gx,gy,gz,ax,ay,az", *rows]).encode()
+
+
+def imu_mapping(axes):
+    names = {"gyro_x": "gx", "gyro_y": "gy", "gyro_z": "gz"}
+    names |= {"accel_x": "ax", "accel_y": "ay", "accel_z": "az"}
+    table = {"file": "file2", "kind": "imu", "axes": axes, "columns": names}
+    table["time"] = {"column": "t", "clock": "utc"}
+    return msgspec.convert({"tables": [table]}, MappingSettings)
+
+
 VELOCITY = ("vel_x_m_s", "vel_y_m_s", "vel_z_m_s")
 FIX = ("lat_deg", "lon_deg", "height_m", "vel_e_m_s", "vel_n_m_s")
 
@@ -77,6 +91,23 @@ def test_stamps_move_from_the_start_of_an_average_to_its_middle(tmp_path):
     # Seconds since 1970 are exact to 2.4e-7 s.
     np.testing.assert_allclose(column(out, "dvl", "time_s")[:, 0] - first, 0.3, atol=1e-6)
     assert any("0.2 s apart" in line and "by 0.3 s" in line for line in decisions.lines)
+
+
+def test_says_when_the_beams_contradict_each_other(tmp_path):
+    def log(*wrong):
+        errors = (0.5 if i in wrong else 0.01 * (-1) ** i for i in range(60))
+        moments = (WHEN + timedelta(seconds=i) for i in range(60))
+        return b"".join(
+            ping(i, (0.1, -1.5, 0.0, error), when)
+            for i, (error, when) in enumerate(zip(errors, moments, strict=True))
+        )
+
+    _, decisions = imported(tmp_path, log(), fixes())
+    assert not decisions.warnings
+    _, decisions = imported(tmp_path, log(40, 41, 42, 43, 44), fixes(), force=True)
+    (warning,) = decisions.warnings
+    assert "5 of 60 pings with an error velocity above 5 σ" in warning
+    assert "from 41 to 43 s after the first ping" in warning
 
 
 def test_says_that_pings_have_no_time(tmp_path):
@@ -240,6 +271,30 @@ class TestAxes:
         velocity = np.linalg.lstsq(directions, beams[0], rcond=None)[0]
         s = np.sin(np.deg2rad(20.0))
         np.testing.assert_allclose(velocity, [-0.1 / s, 0.5 / s, 0.0], atol=1e-6)
+
+    def test_axes_are_named_as_those_of_the_body(self, tmp_path):
+        """Forward 1.5, starboard 0.1, down 0.2 m/s, by a DVL in FRD on bodies of any axes."""
+        names = ("vx", "vy", "vz", "fom", "velocity_valid", "timestamp")
+        cells = ((1.5, 0.1, 0.2, 0.01, 1, WHEN.timestamp() + i) for i in range(30))
+        rows = [names, *cells]
+        log = "\n".join(",".join(map(str, row)) for row in rows).encode()
+        headings = b"".join(
+            writers.nmea(f"GPHDT,{90 + i}.0,T") + fixes(1, WHEN + timedelta(seconds=i))
+            for i in range(30)
+        )
+        # A heading has no axes: the body has those of the DVL.
+        out, _ = imported(tmp_path, log, headings)
+        settings = read_yaml(out / "trial.yaml", dict)
+        assert settings["body_axes"] == "FRD"
+        assert settings["dvl"]["misalignment_std_deg"] == [30.0, 30.0, 180.0]
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [1.5, 0.1, 0.2])
+        files = (log, headings, imu_table())
+        out, decisions = imported(tmp_path, *files, force=True, mapping=imu_mapping("RFU"))
+        assert read_yaml(out / "trial.yaml", dict)["body_axes"] == "RFU"
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [0.1, 1.5, -0.2])
+        assert "axes FRD of the DVL → RFU" in decisions.text("")
+        out, _ = imported(tmp_path, *files, force=True, mapping=imu_mapping("FLU"))
+        np.testing.assert_allclose(column(out, "dvl", *VELOCITY)[0], [1.5, -0.1, -0.2])
 
     def test_lost_pings_are_empty(self, tmp_path):
         bad = ping(99, (None,) * 4, WHEN + timedelta(seconds=40))

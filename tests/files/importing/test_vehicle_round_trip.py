@@ -44,6 +44,18 @@ def telemetry(trial):
     )
 
 
+def test_the_log_of_the_dvl_is_better_than_what_the_vehicle_made_of_it(tmp_path):
+    pytest.importorskip("pymavlink")
+    (tmp_path / "a.tlog").write_bytes(logs.telemetry_trial())
+    utc = 1586044800 + 345600 - 18
+    rows = (f"{utc + 0.1 * i},1.0,0.0,0.0,0.01,1" for i in range(40))
+    table = "\n".join(["timestamp,vx,vy,vz,fom,velocity_valid", *rows])
+    (tmp_path / "dvl.csv").write_text(table)
+    decisions = import_files([tmp_path / "a.tlog", tmp_path / "dvl.csv"], tmp_path / "trial")
+    assert "left out: it repeats the DVL's own log, dvl.csv" in decisions.text("")
+    np.testing.assert_allclose(load_trial(tmp_path / "trial").dvl.velocity, [[1, 0, 0]] * 40)
+
+
 def test_a_vehicle_comes_back_from_its_telemetry(tmp_path):
     pytest.importorskip("pymavlink")
     scenario = config("ship")

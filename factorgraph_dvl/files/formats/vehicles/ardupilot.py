@@ -7,6 +7,7 @@ microseconds since the start, which GPS messages relate to UTC.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -52,6 +53,12 @@ _SIZES |= {
     "q": 8,
     "Q": 8,
 }
+# Parameter by which the autopilot turns movements before it logs them.
+_ORIENT = "VISO_ORIENT"
+_TURNED = (
+    "VISO_ORIENT was {:g}: the movements are turned by it already, and the misalignment is what "
+    "is left"
+)
 
 
 def share(path: Path, sample: bytes) -> float:
@@ -62,7 +69,7 @@ def share(path: Path, sample: bytes) -> float:
 
 
 def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch]:
-    """Read the messages IMU, GPS with GPA, ATT and VISO; others are passed over.
+    """Read the messages IMU, GPS with GPA, ATT and VISO, and the parameter VISO_ORIENT.
 
     Parameters, result and errors are those of `Format.read`.
     """
@@ -97,7 +104,7 @@ def _passed_over(log: Any) -> Losses:
     losses = Losses()
     for number, count in enumerate(log.counts):
         name = log.id_to_name.get(number, str(number))
-        if name == "GPA":
+        if name in _HELPERS:
             losses.use(name, int(count))
         elif name not in _CONVERTERS:
             losses.skip(name, UNKNOWN_TYPE, int(count))
@@ -149,6 +156,7 @@ def _definition(message: bytes) -> tuple[int, int]:
 def _batches(path: Path, log: Any, note: str) -> Iterator[Batch]:
     gathered: dict[str, list[Row]] = {}
     accuracy: dict[str, Row] = {}
+    notes: dict[str, None] = {}
     count = 0
     while True:
         try:
@@ -163,6 +171,10 @@ def _batches(path: Path, log: Any, note: str) -> Iterator[Batch]:
             if name == "GPA":
                 accuracy[str(instance)] = row
                 continue
+            if name == "PARM":
+                if row.get("Name") == _ORIENT and row.get("Value", 0.0) != 0.0:
+                    notes[_TURNED.format(row["Value"])] = None
+                continue
             if name == "GPS":
                 row["accuracy"] = accuracy.get(str(instance), {})
             gathered.setdefault(f"{name}[{instance}]", []).append(row)
@@ -175,12 +187,11 @@ def _batches(path: Path, log: Any, note: str) -> Iterator[Batch]:
             break
     if not count:
         raise DataError(note or "has no messages", where=path.name, expected="a log of ArduPilot")
-    if note:
-        yield Batch("clock", empty("clock", 0), notes=(note,))
+    yield replace(left_out(Losses()), notes=(*notes, *filter(None, [note])))
 
 
 def _next(log: Any) -> Row | None:
-    message = log.recv_match(type=[*_CONVERTERS, "GPA"], strict=True)
+    message = log.recv_match(type=[*_CONVERTERS, *_HELPERS], strict=True)
     return None if message is None else message.to_dict()
 
 
@@ -227,6 +238,8 @@ def _odometry(stream: str, rows: list[Row]) -> Batch:
     return movements(out, columns(rows, "PosDX", "PosDY", "PosDZ"), column(rows, "dt"), stream)
 
 
+# Messages that are read for the sake of others.
+_HELPERS = ("GPA", "PARM")
 _CONVERTERS = {"IMU": _imu, "ATT": _attitude, "GPS": _fix, "VISO": _odometry}
 
 FORMAT = Format(

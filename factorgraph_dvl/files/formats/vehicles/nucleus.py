@@ -1,7 +1,10 @@
 """Nortek Nucleus: packets decoded by nucleus-driver, found by their checksums here.
 
-Units and axes are those that the names in the maker's driver state: m/s, rad/s, degrees; forward,
-right, down. They were not compared with an instrument.
+Units are those that the names in the maker's driver state: m/s, rad/s, degrees. Axes are forward,
+right, down: the maker's program for a BlueROV passes velocities X, Y, Z on as movements in these
+(`VISION_POSITION_DELTA`), and in a recording at rest the specific force has the signs that pitch
+and roll of the AHRS give it. `timeVelBeam` is taken as the duration of a velocity estimate, which
+the records of the maker's other DVLs name in the same place.
 """
 
 from __future__ import annotations
@@ -24,21 +27,30 @@ from factorgraph_dvl.files.formats.vehicles.library import (
     silently,
     started,
 )
-from factorgraph_dvl.files.formats.velocities import INSTRUMENT
+from factorgraph_dvl.files.formats.velocities import INSTRUMENT, mean_of_known
 from factorgraph_dvl.geometry.units import DEG, MICROSECOND
 
 IMU, AHRS, BOTTOM, WATER, INS = 0x82, 0xD2, 0xB4, 0xBE, 0xDC
 # A calibration must not be compared with what was made of the same data.
 _INS = "packets of the INS were left out: it navigates by the same IMU and DVL"
 _NAMES = {
+    0x20: "spectrum (packet 0x20)",
     0x87: "magnetometer (packet 0x87)",
-    0xAA: "current profile (packet 0xAA)",
+    0x8B: "field calibration (packet 0x8B)",
+    0x96: "fast pressure (packet 0x96)",
+    0xA0: "text (packet 0xA0)",
+    0xAA: "altimeter (packet 0xAA)",
+    0xC0: "current profile (packet 0xC0)",
+    0xC1: "current profile (packet 0xC1)",
     INS: "INS (packet 0xDC)",
 }
 _HEADER = 10
 # Without an echo the driver passes on these.
 _NO_VELOCITY, _NO_MERIT = -32.0, 10.0
-_AXES = "axes of the Nucleus taken as forward, right, down: not verified"
+_AXES = (
+    "axes of the Nucleus taken as forward, right, down, as by the maker's program for a BlueROV; "
+    "rotations that were set in the instrument (SETINST) are in them"
+)
 _SHIFT = "stamps of velocities were shifted by dtXYZ, from the stamp to their measurement"
 Packet = dict[str, Any]
 
@@ -146,6 +158,8 @@ def _track(kind: Kind, stream: str) -> Callable[[list[Packet]], Iterator[Batch]]
         out["temperature"] = column(packets, "temperature")
         delay = column(packets, "dtXYZ")
         out["delay"] = np.where((delay > 0.0) & (delay < 1.0), delay, np.nan)
+        duration = columns(packets, *(f"timeVelBeam{i}" for i in (1, 2, 3)))
+        out["window"] = mean_of_known(np.where(duration < 1.0, duration, np.nan))
         note = "velocities along beams were left out: directions and signs are not documented"
         shifted = (_SHIFT,) if np.isfinite(out["delay"]).any() else ()
         notes = (_AXES, note, *shifted)
@@ -169,7 +183,7 @@ FORMAT = Format(
     read=read,
     verified=(
         "a recording at rest (17,773 packets of the IMU), counts by type by "
-        "the parser of nucleus-driver; axes of velocities not verified"
+        "the parser of nucleus-driver; velocities by their document only: it has no lock"
     ),
     endings=(".nucleus",),
     module="nucleus_driver",

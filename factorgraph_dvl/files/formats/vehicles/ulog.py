@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.format import Batch, Format, empty, left_out, positive
 from factorgraph_dvl.files.formats.framing import Source, map_file
-from factorgraph_dvl.files.formats.losses import UNKNOWN_TYPE, Losses
+from factorgraph_dvl.files.formats.losses import REPEATED, UNKNOWN_TYPE, Losses
 from factorgraph_dvl.files.formats.vehicles.library import (
     gga_quality,
     load,
@@ -97,7 +97,7 @@ def _passed_over(source: Source, read: Container[str]) -> Losses:
     for number, count in counts.items():
         topic = topics.get(number, _NO_TOPIC)
         if topic not in read:
-            losses.skip(topic, UNKNOWN_TYPE, count)
+            losses.skip(topic, REPEATED if topic in CONVERTERS else UNKNOWN_TYPE, count)
     return losses
 
 
