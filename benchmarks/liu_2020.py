@@ -209,7 +209,8 @@ shows the constant drift of the gyros. Scenario ([`configs/star.yaml`](../config
 135° E 25° N, 2018-12-01T05:30:00Z, position error 20 m, drifts 0.05, 0.1 and 0.2 °/h, star tracker
 5″ at 2 Hz, SINS at 50 Hz. The paper states neither the noise of the gyros nor the sea. This study
 uses gyros without noise and a gentle sea. *Factor graph* is `factorgraph-dvl solve`. *Kalman* is
-`kalman --method star`, the paper's six-state filter ([`kalman.md`](kalman.md#star-six-states)).
+`kalman --method star`, the paper's six-state filter, corrected
+([`kalman.md`](kalman.md#star-six-states)).
 
 ## The bound
 

@@ -35,7 +35,7 @@ Our copies are text. They keep the quantities and units of the printed axes, but
 The figures here have these quantities and units, and lines at the printed values:
 
 ```sh
-factorgraph-dvl reproduce luo-2024 --out DIR --table 3     # or --figure N, or neither for all
+factorgraph-dvl reproduce luo-2024 --out DIR --seeds {count} --table 3    # or --figure N, or all
 ```
 
 The others are `liu-2020`, `nine-state`, `beams` and `chen-2021`.
@@ -58,7 +58,8 @@ def sample() -> list[str]:
 def main() -> None:
     """Run all publications and write the page."""
     args = common.parse(common.parser(__doc__, seeds=4))
-    lines = INTRODUCTION.format(origin=args.origin, seeds=counted(args.seeds)).splitlines()
+    seeds = counted(args.seeds)
+    lines = INTRODUCTION.format(origin=args.origin, seeds=seeds, count=args.seeds).splitlines()
     verdicts: dict[str, int] = {}
     for paper in PAPERS.values():
         results = []

@@ -224,7 +224,8 @@ def tables(found: dict[tuple[str, str], list[Run]]) -> list[str]:
         "## Standard deviations",
         "",
         "RMS of errors over σ, of what a method calls observable: 1 is right, 3 means that errors "
-        "are three times what σ says. –: it has no σ, no answer, or calls nothing observable.",
+        "are three times what σ says. –: it has no σ of its own (that which `kalman` prints is "
+        "the scatter of the residuals), no answer, or calls nothing observable.",
         "",
         head,
         rule,
