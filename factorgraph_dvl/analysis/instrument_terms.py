@@ -56,6 +56,9 @@ class InstrumentTerms:
     as_frd : Angles
         Angles of C_d^b, ZYX, for makers whose axes are forward, starboard, down: with the recorded
         axes named as `axes_as` does it for them.
+    after_offset : Angles
+        Angles, ZYX, that are left of `as_frd` once the DVL turns its velocities by
+        `rotation_offset`, exactly.
     scale_error, scale_std : ndarray, shape (n,)
         Dimensionless.
     scale_grade : tuple of Grade
@@ -83,6 +86,7 @@ class InstrumentTerms:
     dvl_in_body: dict[Order, Angles]
     body_to_dvl: dict[Order, Angles]
     as_frd: Angles
+    after_offset: Angles
     scale_error: Array
     scale_std: Array
     scale_grade: tuple[Grade, ...]
@@ -191,6 +195,12 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     def frd_angles(vector: Array) -> Array:
         return euler((named @ exp_so3(vector * DEG) @ frd.T).T, "ZYX")
 
+    as_frd = angles(frd_angles)
+    turned_back = Rotation.from_euler("z", -as_frd.value[2], degrees=True).as_matrix()
+
+    def angles_after_offset(vector: Array) -> Array:
+        return euler((named @ exp_so3(vector * DEG) @ frd.T).T @ turned_back, "ZYX")
+
     def rpy(order: Order, *, inverse: bool) -> Angles:
         def of(vector: Array) -> Array:
             C = frd @ exp_so3(vector * DEG) @ frd.T
@@ -210,7 +220,8 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     return InstrumentTerms(
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
-        as_frd=angles(frd_angles),
+        as_frd=as_frd,
+        after_offset=angles(angles_after_offset),
         scale_error=scale,
         scale_std=np.sqrt(np.diag(scale_covariance)),
         scale_grade=graded[SCALE_ERROR],

@@ -187,8 +187,8 @@ def _ardupilot(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
         yield Setting(f"VISO_ORIENT,{_ROTATIONS[nearest]}", (i.dvl_in_body["ZYX"].grade[2],))
         yield (
             f"VISO_ORIENT turns by 90 deg only. The rest is yaw {fixed(rest, 2)}, pitch "
-            f"{fixed(pitch, 2)}, roll {fixed(roll, 2)} deg: {_ELSEWHERE}, or in the program "
-            "that sends the messages"
+            f"{fixed(pitch, 2)}, roll {fixed(roll, 2)} deg: enter it in the program that sends "
+            "the messages, which turns movements before VISO_ORIENT does"
         )
     yield "VISO_SCALE multiplies positions. Movements (VISION_POSITION_DELTA) are not scaled."
     scale = 1.0 / (1.0 + float(np.mean(i.scale_error)))
@@ -223,8 +223,10 @@ def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Line
     It is the clockwise angle about Z from the vehicle's forward axis to that of the DVL; the DVL
     turns its output back by it. For roll and pitch there is no setting.
     """
-    roll, pitch, _ = (float(x) for x in i.as_frd.value)
-    if not looks_down(i.attitude_as(WATER_LINKED_AXES)):
+    down = looks_down(i.attitude_as(WATER_LINKED_AXES))
+    left = i.after_offset if down else i.as_frd
+    roll, pitch, yaw = (fixed(float(x), 2) for x in left.value)
+    if not down:
         yield f"mounting_rotation_offset: none for a DVL that does not look down: {_ELSEWHERE}"
     else:
         parameters = {"mounting_rotation_offset": round(i.rotation_offset, 2)}
@@ -233,7 +235,8 @@ def _water_linked(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Line
         yield "It is valid if the offset was 0 in the trial."
         yield "Software before 2.2.1 takes whole degrees."
         yield Setting(json.dumps(command), (i.dvl_in_body["ZYX"].grade[2],))
-    yield from _not_set("Water Linked", i, f"roll {fixed(roll, 2)}, pitch {fixed(pitch, 2)} deg")
+    after = "after the offset, " if down else ""
+    yield from _not_set("Water Linked", i, f"{after}roll {roll}, pitch {pitch}, yaw {yaw} deg")
 
 
 def _nucleus(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:

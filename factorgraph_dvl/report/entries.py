@@ -35,14 +35,22 @@ _MAKERS = {
     "Delph": ("exail", "ixblue", "ixsea", "delph"),
 }
 _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
+_ONCE = "Enter the angles once: in the DVL or in the navigation software, not in both."
 _REMARKS = {
-    "TRDI": (_AT_ZERO,),
+    "TRDI": (_AT_ZERO, _ONCE),
     "Nortek": (
+        _AT_ZERO,
+        _ONCE,
         "The sign of yaw is the maker's. Those of roll and pitch are assumed: check one before "
         "use.",
     ),
-    "Water Linked": (_AT_ZERO,),
+    "Water Linked": (
+        _AT_ZERO,
+        "Enter the offset in the DVL and the angles after it in the navigation software, or roll, "
+        "pitch and yaw there and no offset. The DVL has no setting for scale error and lever arm.",
+    ),
     "Delph": (
+        _AT_ZERO,
         "The signs of the lever arm are the maker's. Those of the angles are assumed: check one "
         "before use.",
     ),
@@ -220,7 +228,15 @@ def maker_rows(i: InstrumentTerms, maker: str) -> list[tuple[str, str, str, str,
         ]
     if known == "Water Linked" and looks_down(i.attitude_as(WATER_LINKED_AXES)):
         offset = with_std(i.rotation_offset, i.as_frd.std[2])
-        return [("Water Linked mounting rotation offset", offset, "deg", "to starboard", ("yaw",))]
+        rules = ("starboard down", "bow up", "to starboard")
+        left = i.after_offset
+        return [
+            ("Water Linked mounting rotation offset", offset, "deg", "to starboard", ("yaw",)),
+            *(
+                (f"after the offset: {name}", with_std(a, std), "deg", rule, angles)
+                for name, a, std, rule in zip(angles, left.value, left.std, rules, strict=True)
+            ),
+        ]
     if known == "Delph":
         turned, arm = i.dvl_in_body["ZYX"], i.lever_arm
         heading, pitch, roll = turned.value[::-1]

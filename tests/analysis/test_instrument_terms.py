@@ -144,7 +144,10 @@ def test_recorded_axes_are_those_of_the_maker_or_of_the_body(maker, recorded, bo
         == {
             "trdi": {"EA": 3000, "EI": 0, "EJ": 0},
             "nortek": {"roll_pitch_yaw_deg": [0.0, 0.0, 30.0]},
-            "water_linked": {"mounting_rotation_offset": 30.0},
+            "water_linked": {
+                "mounting_rotation_offset": 30.0,
+                "roll_pitch_yaw_after_offset_deg": [0.0, 0.0, 0.0],
+            },
         }[maker]
     )
 
@@ -191,8 +194,10 @@ def test_each_maker_s_numbers_give_the_mounting_back_by_its_rule(body_axes):
     forward = C_db[:, 0]
     assert np.arctan2(forward[1], forward[0]) / DEG % 360.0 == pytest.approx(offset, abs=0.005)
     assert 0.0 <= offset < 360.0
+    roll, pitch, yaw = data["water_linked"]["roll_pitch_yaw_after_offset_deg"]
+    left = rotation(2, yaw) @ rotation(1, pitch) @ rotation(0, roll)
+    np.testing.assert_allclose(left @ rotation(2, offset), C_db, atol=0.01 * DEG)
     assert text.count("NOT VERIFIED") == 2
-    assert f"tilt of {np.hypot(*data['nortek']['roll_pitch_yaw_deg'][:2]):.2f} deg" in text
 
 
 def test_trdi_s_commands_of_the_text_turn_a_ship_s_velocity_into_the_instrument_s():

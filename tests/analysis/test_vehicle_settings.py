@@ -180,6 +180,13 @@ def test_water_linked(alpha: np.ndarray) -> None:
     assert abs((bearing - offset + 180.0) % 360.0 - 180.0) <= 0.005
     assert 0 <= offset < 360
     assert "scale error: 1.000 %" in text
+    # The DVL turns what it sends; the navigation software turns that by what is left.
+    angles = re.search(r"after the offset, roll (\S+), pitch (\S+), yaw (\S+) deg", text)
+    assert angles is not None
+    left = Rotation.from_euler("ZYX", [float(x) for x in angles.groups()][::-1], degrees=True)
+    sent = Rotation.from_euler("z", offset, degrees=True)
+    turned = (left * sent).as_matrix()
+    np.testing.assert_allclose(turned, from_dvl(alpha, FRD), atol=3e-4)
 
 
 def test_nucleus_has_no_setting() -> None:

@@ -30,7 +30,6 @@ AXES = {
 }
 TILTED = {"misalignment_deg": [2.0, -1.5, 30.0], "lever_arm_m": [1.2, 0.7, -1.4]}
 TURNED = {"misalignment_deg": [0.0, 0.0, -45.0], "lever_arm_m": [-2.0, 0.3, 1.1]}
-LEVEL = {"misalignment_deg": [0.0, 0.0, -30.4], "lever_arm_m": [-2.0, 0.3, 1.1]}
 
 
 def trdi(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
@@ -59,11 +58,17 @@ def nortek(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
 
 
 def water_linked(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
-    """Return velocities forward, starboard, down: the DVL's x axis is clockwise of the bow."""
+    """Return velocities forward, starboard, down: the DVL's x axis is clockwise of the bow.
+
+    The DVL turns what it sends about its own z axis; the navigation software turns that by the
+    angles that are left.
+    """
     angle = np.radians(typed["Water Linked mounting rotation offset"])
     x, y, z = velocity.T
     forward = x * np.cos(angle) - y * np.sin(angle)
-    return np.stack([forward, x * np.sin(angle) + y * np.cos(angle), z], axis=1)
+    sent = np.stack([forward, x * np.sin(angle) + y * np.cos(angle), z], axis=1)
+    left = [typed[f"after the offset: {name}"] for name in ("yaw", "pitch", "roll")]
+    return Rotation.from_euler("ZYX", left, degrees=True).apply(sent)
 
 
 def delph(typed: dict[str, float], velocity: np.ndarray) -> np.ndarray:
@@ -108,14 +113,14 @@ def printed(solution, maker: str) -> dict[str, float]:
         ("Teledyne RDI Pathfinder", "RFU", "RFU", TURNED, trdi),
         ("Nortek DVL1000", "FRD", "FRD", TILTED, nortek),
         ("Nortek DVL1000", "FRD", "FRD", TURNED, nortek),
-        # Water Linked takes no tilt.
-        ("Water Linked A50", "FRD", "FRD", LEVEL, water_linked),
+        ("Water Linked A50", "FRD", "FRD", TILTED, water_linked),
+        ("Water Linked A50", "FRD", "FRD", TURNED, water_linked),
         ("Exail Delph INS", "FLU", "FLU", TILTED, delph),
         ("Exail Delph INS", "FLU", "FLU", TURNED, delph),
         # The DVL measures in its maker's axes, and the IMU in others.
         ("Teledyne RDI Pathfinder", "FRD", "RFU", TILTED, trdi),
         ("Nortek DVL1000", "RFU", "FRD", TILTED, nortek),
-        ("Water Linked A50", "FLU", "FRD", LEVEL, water_linked),
+        ("Water Linked A50", "FLU", "FRD", TILTED, water_linked),
     ],
 )
 def test_a_dvl_configured_as_printed_has_no_misalignment_and_no_lever_arm(

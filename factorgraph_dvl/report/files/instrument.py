@@ -159,11 +159,12 @@ def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iter
     """Yield the calibration in the conventions of other makers, with their sign rules."""
     roll, pitch, yaw = (float(x) for x in i.dvl_in_body["ZYX"].value)
     water_linked = i.attitude_as(WATER_LINKED_AXES)
-    tilt = float(np.hypot(*i.as_frd.value[:2]))
     mean = float(np.mean(i.scale_error))
     forward, starboard, down = (float(x) for x in i.lever_arm)
     yield from (
         "",
+        "# The following are valid if the settings of the instrument were 0 in the trial.",
+        "#",
         "# Nortek: attitude of the DVL in the vehicle, axes forward, starboard, down; yaw first,",
         "# then pitch, then roll; each positive by the right hand about its axis. Sign rule of",
         "# yaw: DVL manual (2017), from the vehicle's forward axis to the DVL's X axis, and",
@@ -175,7 +176,9 @@ def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iter
         "",
         "# Water Linked: one angle, from the vehicle's forward axis to that of the DVL, positive",
         "# clockwise from above, from 0 to 360 deg; software before 2.2.1 takes whole degrees.",
-        f"# Sign rule: DVL documentation, page Axes. Left out: tilt of {fixed(tilt, 2)} deg.",
+        "# Sign rule: DVL documentation, page Axes. The DVL has no setting for the angles that",
+        "# are left after this offset: enter them in your navigation software; yaw first, then",
+        "# pitch, then roll.",
         f"# {RECORDED_AXES[i.axes_as(WATER_LINKED_AXES)]}",
         *(() if looks_down(water_linked) else (_LOOKS_UP,)),
         "water_linked:",
@@ -183,6 +186,7 @@ def _makers(i: InstrumentTerms, angles: Grade, scale: Grade, arm: Grade) -> Iter
             f"  mounting_rotation_offset: {fixed(i.rotation_offset, 2)}",
             i.dvl_in_body["ZYX"].grade[2],
         ),
+        _line(f"  roll_pitch_yaw_after_offset_deg: {_list(i.after_offset.value, 2)}", angles),
         "",
         "# Delph-style: axes XV1 forward, XV2 to port, XV3 up: Advanced Configuration User Guide",
         f"# of OCTANS (2015). The lever arm runs from the {i.origin} to the DVL. Heading is",
