@@ -20,8 +20,13 @@ def entries_content(result: Result) -> Iterator[Html]:
     terms = instrument_of(result.solution)
     if (found := sum_with_compass(result.solution.findings)) is not None:
         yield paragraph(joined(both("Mount and compass:"), both(str(found), found.chinese)))
-    yield values_to_enter(terms, result.maker)
-    yield vessel_drawing(terms, result.solution, result.run.get("settings", {}))
+    drawing = vessel_drawing(terms, result.solution, result.run.get("settings", {}))
+    yield element(
+        "div",
+        element("div", values_to_enter(terms, result.maker)),
+        element("div", drawing),
+        class_="entries",
+    )
 
 
 def values_to_enter(terms: InstrumentTerms, maker: str | None = None) -> Html:
