@@ -1,9 +1,8 @@
 """Pictures of the pages, drawn into docs/images.
 
-    python docs/pictures.py [--reports] [--recordings FILE...]
+    python docs/pictures.py [--reports]
 
-`--reports` draws the reports of the shipped trial as well, `--recordings` those of raw files, in
-the two commands of `docs/import.md`. Screenshots of reports need chromium; without it they stay as
+`--reports` draws the reports of the shipped trial as well. Screenshots of reports need chromium; without it they stay as
 they are.
 """
 
@@ -189,18 +188,6 @@ def reports() -> None:
                 shutil.copy(out / "figures" / "calibration.png", IMAGES)
 
 
-def recordings(files: Iterable[str]) -> None:
-    """Show the reports of raw files, from file to verdict."""
-    program = [sys.executable, "-m", "factorgraph_dvl.cli"]
-    for file in files:
-        with tempfile.TemporaryDirectory() as folder:
-            trial, out = Path(folder) / "trial", Path(folder) / "out"
-            subprocess.run([*program, "import", file, "--out", trial, "--quiet"], check=True)
-            # Exit code 1: the result is not to be used.
-            subprocess.run([*program, "solve", trial, "--out", out, "--quiet"], check=False)
-            screenshot(out / "report.html", f"import-{Path(file).stem}.png", "en")
-
-
 def main() -> None:
     """Draw all pictures."""
     mpl.rcParams |= {"svg.hashsalt": "factorgraph-dvl", "font.size": 10}
@@ -208,8 +195,6 @@ def main() -> None:
         figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
     if "--reports" in sys.argv:
         reports()
-    if "--recordings" in sys.argv:
-        recordings(sys.argv[sys.argv.index("--recordings") + 1 :])
 
 
 if __name__ == "__main__":
