@@ -2,8 +2,8 @@
 
     python docs/pictures.py [--reports]
 
-`--reports` draws the reports of the shipped trial as well. Screenshots of reports need chromium; without it they stay as
-they are.
+`--reports` draws the reports of the shipped trial as well. Screenshots need chromium; without it
+they stay as they are.
 """
 
 from __future__ import annotations
