@@ -43,6 +43,8 @@ _BLOCK = 500
 _VIBRATION = 8.0
 _FILTER = 0.5
 _GOES_ON = 10
+# Share of a motion below which what passes the filter is no vibration. Chosen: it leaks less.
+_LEAK = 1e-3
 # Standard deviations of its power by which vibration exceeds noise. Chosen: chance never does.
 _SURE = 5.0
 # Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
@@ -145,7 +147,8 @@ def _vibration(values: Array, dt: float, sigma: float) -> Array | None:
     fast = np.asarray(correlate1d(values, passed, axis=0, mode="nearest"))
     by_noise = sigma**2 * float(passed @ passed)
     chance = 1.25 * by_noise * np.sqrt(2.0 / values.size)
-    return fast if _power(fast, dt) > by_noise + _SURE * chance else None
+    least = by_noise + _SURE * chance + _LEAK**2 * float(np.mean(values**2))
+    return fast if _power(fast, dt) > least else None
 
 
 def _power(fast: Array | None, dt: float) -> float:
