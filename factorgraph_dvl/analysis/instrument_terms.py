@@ -178,7 +178,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     frd = frd_from_body(calibration.body_axes)
     recorded = exp_so3(alpha * DEG) @ frd.T
     trdi = frd_from_body(axes_as(recorded, TRDI_AXES, calibration.body_axes))
-    named = frd_from_body(axes_as(recorded, "FRD", calibration.body_axes))
+    named = axes_as(recorded, "FRD", calibration.body_axes)
 
     def angles(of: Callable[[Array], Array]) -> Angles:
         """Return angles that depend on the rotation vector, and their standard deviations."""
@@ -192,14 +192,12 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
         return Angles(value, std, grades(std, seen[most], limit))
 
-    def frd_angles(vector: Array) -> Array:
-        return euler((named @ exp_so3(vector * DEG) @ frd.T).T, "ZYX")
+    def frd_attitude(vector: Array) -> Array:
+        return attitude_of(exp_so3(vector * DEG) @ frd.T, named)
 
-    as_frd = angles(frd_angles)
+    as_frd = angles(lambda vector: euler(frd_attitude(vector), "ZYX"))
     turned_back = Rotation.from_euler("z", -as_frd.value[2], degrees=True).as_matrix()
-
-    def angles_after_offset(vector: Array) -> Array:
-        return euler((named @ exp_so3(vector * DEG) @ frd.T).T @ turned_back, "ZYX")
+    after_offset = angles(lambda vector: euler(frd_attitude(vector) @ turned_back, "ZYX"))
 
     def rpy(order: Order, *, inverse: bool) -> Angles:
         def of(vector: Array) -> Array:
@@ -221,7 +219,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         dvl_in_body={order: rpy(order, inverse=True) for order in ORDERS},
         body_to_dvl={order: rpy(order, inverse=False) for order in ORDERS},
         as_frd=as_frd,
-        after_offset=angles(angles_after_offset),
+        after_offset=after_offset,
         scale_error=scale,
         scale_std=np.sqrt(np.diag(scale_covariance)),
         scale_grade=graded[SCALE_ERROR],

@@ -107,16 +107,18 @@ def unsmoothed(dt: float, sigma: float) -> Smoothed:
     return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, 0)
 
 
-def best_window(values: Array, dt: float, sigma: float) -> int:
+def best_window(values: Array, dt: float, sigma: float) -> tuple[int, float]:
     """Return the window with the least error of noise and motion together, 0 for none.
+
+    The mean square of the vibration comes with it.
 
     What a window takes of a sway that goes on is alike in many measurements, and counts as often.
     So does vibration that it leaves: no measurement is known to follow it.
     """
     few = values[:_ENOUGH]
-    vibration = _vibration(few, dt, sigma)
+    vibration, power = _vibration(few, dt, sigma)
     motion = few if vibration is None else few - vibration
-    best, width = sigma**2 + _REPEATED * _power(vibration, dt), 0
+    best, width = sigma**2 + _REPEATED * power, 0
     for half in _HALF_WIDTHS:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
@@ -133,14 +135,17 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
         error = by_motion + goes_on + sigma**2 * kept
         if error < best:
             best, width = error, window
-    return width
+    return width, power
 
 
-def _vibration(values: Array, dt: float, sigma: float) -> Array | None:
-    """Return what is faster than motion and goes on, (N, 3); None where that is only noise."""
+def _vibration(values: Array, dt: float, sigma: float) -> tuple[Array | None, float]:
+    """Return what is faster than motion and goes on, (N, 3), and its mean square.
+
+    None and 0 where that is only noise.
+    """
     half = round(_FILTER / dt)
     if 4.0 * _VIBRATION * dt > 1.0 or _GOES_ON * 2 * half > values.shape[0]:
-        return None
+        return None, 0.0
     taps = np.sinc(2.0 * _VIBRATION * dt * np.arange(-half, half + 1)) * np.blackman(2 * half + 1)
     passed = -taps / taps.sum()
     passed[half] += 1.0
@@ -148,16 +153,15 @@ def _vibration(values: Array, dt: float, sigma: float) -> Array | None:
     by_noise = sigma**2 * float(passed @ passed)
     chance = 1.25 * by_noise * np.sqrt(2.0 / values.size)
     least = by_noise + _SURE * chance + _LEAK**2 * float(np.mean(values**2))
-    return fast if _power(fast, dt) > least else None
+    power = _power(fast, dt)
+    return (fast, power) if power > least else (None, 0.0)
 
 
-def _power(fast: Array | None, dt: float) -> float:
+def _power(fast: Array, dt: float) -> float:
     """Return the mean square of a vibration, the median of that of short times.
 
     A step is fast only for a short time.
     """
-    if fast is None:
-        return 0.0
     return float(np.median(_means(np.mean(fast**2, axis=1), round(2.0 * _FILTER / dt))))
 
 
@@ -197,12 +201,11 @@ def smooth(
     with_misfit : bool, default True
         Whether to find what the window does not resolve.
     """
-    width = best_window(values, dt, sigma) if window is None else window
+    width, vibration = best_window(values, dt, sigma) if window is None else (window, 0.0)
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
     # Vibration is no step: if a measurement follows it, its residuals show that.
-    shaking = _power(_vibration(values[:_ENOUGH], dt, sigma), dt) if window is None else 0.0
-    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(shaking)))
+    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(vibration)))
     misfit: Array | None
     if values.shape[0] > _SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
@@ -219,7 +222,7 @@ def smooth(
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * slope_gain(width) / dt,
         window=width,
-        vibrates=shaking > 0.0,
+        vibrates=vibration > 0.0,
     )
 
 
