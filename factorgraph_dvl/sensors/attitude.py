@@ -253,8 +253,10 @@ def spaced(time: Array, usable: NDArray[np.bool_], apart: float) -> NDArray[np.i
 
 def heading_error(
     time: Array, heading: Array, values: Values, zero: float
-) -> tuple[Array, dict[str, Array]]:
-    """Return the lasting error of a heading, (M,), rad, and its derivatives, (M, n) by name.
+) -> tuple[Array, dict[str, Array], Array]:
+    """Return the lasting error of a heading, (M,), rad, with its derivatives.
+
+    These are (M, n) by the name of a parameter, and (M,) by the heading.
 
         e = o + a cos w (t - t0) + b sin w (t - t0)
           + d1 sin h + d2 cos h + d3 sin 2 h + d4 cos 2 h
@@ -279,10 +281,14 @@ def heading_error(
         ),
     }
     by = {name: matrix for name, matrix in by.items() if name in values}
-    total = np.zeros(time.size)
+    total, by_heading = np.zeros((2, time.size))
     for name, matrix in by.items():
         total += matrix @ values[name]
-    return total, by
+    if DEVIATION in by:
+        d1, d2, d3, d4 = values[DEVIATION]
+        sin_1, cos_1, sin_2, cos_2 = by[DEVIATION].T
+        by_heading = d1 * cos_1 - d2 * sin_1 + 2.0 * (d3 * cos_2 - d4 * sin_2)
+    return total, by, by_heading
 
 
 def dense_angles(
@@ -366,19 +372,23 @@ class AttitudeAngles(ObservationByRows):
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
-        residual, rph, by = self._predict(motion, values)
+        residual, rph, by, by_heading = self._predict(motion, values)
+        by_attitude = rph_jacobian(rph, self.body_axes)
+        by_attitude[:, 2] *= 1.0 + by_heading[:, None]
         found = {}
         for name in self.parameters:
             if name in wanted:
                 found[name] = np.zeros((*residual.shape, by[name].shape[1]))
                 found[name][:, 2] = by[name]
-        return Linearization(residual, rph_jacobian(rph, self.body_axes), d_parameters=found)
+        return Linearization(residual, by_attitude, d_parameters=found)
 
-    def _predict(self, motion: Motion, values: Values) -> tuple[Array, Array, dict[str, Array]]:
+    def _predict(
+        self, motion: Motion, values: Values
+    ) -> tuple[Array, Array, dict[str, Array], Array]:
         lat, lon, _ = self.frame.geodetic(motion.p_n)
         lRb = self.frame.level_from_tangent(lat, lon) @ motion.nRb
         rph = rph_from_rotation(lRb, self.body_axes)
         own = {name: values[name] for name in self.parameters if name in values}
-        lasting, by = heading_error(self.time, rph[:, 2], own, 0.0)
+        lasting, by, by_heading = heading_error(self.time, rph[:, 2], own, 0.0)
         predicted = rph + lasting[:, None] * np.array([0.0, 0.0, 1.0])
-        return wrapped(predicted - self.measured), rph, by
+        return wrapped(predicted - self.measured), rph, by, by_heading

@@ -20,7 +20,6 @@ from factorgraph_dvl.solvers.levenberg_marquardt import (
     Minimum,
     factorized,
     minimise,
-    quickly_factorized,
 )
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.statistics.marginal_likelihood import constants_of, restricted_objective
@@ -297,7 +296,7 @@ def with_objective(
         # Where constants are at a maximum of their likelihood, the cost has none.
         evaluation = problem.weighed(problem.without_tilt(evaluation))
         tilt, problem.tilt = problem.tilt, None
-        information = (quickly_factorized if rough else factorized)(problem, evaluation)[0]
+        information = factorized(problem, evaluation, rough=rough)[0]
         problem.tilt = tilt
         model = replace(model, reference=(evaluation.states, evaluation.parameters))
     elif information is None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import compress
 
 import gtsam
 import numpy as np
@@ -44,13 +45,17 @@ class SquareRootInformation:
 
     Parameters
     ----------
-    trees : iterable of gtsam.GaussianBayesTree
-        Bayes trees from QR elimination of all variables, or of one part after another.
+    trees : iterable of gtsam.GaussianBayesTree or gtsam.GaussianBayesNet
+        What the elimination of all variables leaves, or of one part after another.
     sizes : mapping of int to int
         Dimension of every variable by key.
     """
 
-    def __init__(self, trees: Iterable[gtsam.GaussianBayesTree], sizes: Mapping[int, int]) -> None:
+    def __init__(
+        self,
+        trees: Iterable[gtsam.GaussianBayesTree | gtsam.GaussianBayesNet],
+        sizes: Mapping[int, int],
+    ) -> None:
         self._sizes = sizes
         # From the leaves to the root; then the other way round.
         self._cliques: list[_Clique] = []
@@ -98,20 +103,23 @@ class SquareRootInformation:
         ValueError
             If others were eliminated after them.
         """
+        known = frozenset(known)
         cliques = []
         for clique in self._cliques:
-            frontals = tuple(key for key in clique.frontals if key not in known)
-            separators = tuple(key for key in clique.separators if key not in known)
-            # The last clique may have some of both: then the known ones come after the others.
-            last = len(frontals) == len(clique.frontals)
-            if frontals != clique.frontals[: len(frontals)] or (separators and not last):
-                raise ValueError("the known variables must be eliminated after all others")
-            if not frontals:
-                continue
-            n = sum(self._sizes[key] for key in frontals)
-            keep = [key not in known for key in clique.separators for _ in range(self._sizes[key])]
-            T = clique.T[:n, np.array(keep, bool)]
-            cliques.append(_Clique(frontals, separators, clique.R[:n, :n], T, clique.d[:n]))
+            kept = [key not in known for key in clique.separators]
+            frontals, R, d = clique.frontals, clique.R, clique.d
+            if not known.isdisjoint(frontals):
+                # The last clique may have some of both, of which the known ones come last.
+                frontals = tuple(key for key in frontals if key not in known)
+                if any(kept) or frontals != clique.frontals[: len(frontals)]:
+                    raise ValueError("the known variables must be eliminated after all others")
+                if not frontals:
+                    continue
+                n = sum(self._sizes[key] for key in frontals)
+                R, d = R[:n, :n], d[:n]
+            columns = np.repeat(np.array(kept, bool), [self._sizes[k] for k in clique.separators])
+            separators = tuple(compress(clique.separators, kept))
+            cliques.append(_Clique(frontals, separators, R, clique.T[: d.size, columns], d))
         out = SquareRootInformation([], self._sizes)
         out._cliques = cliques
         return out
@@ -352,6 +360,58 @@ def eliminated(
     return SquareRootInformation(trees, sizes)
 
 
+def cholesky(
+    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> gtsam.GaussianBayesTree | gtsam.GaussianBayesNet | None:
+    """Return what Cholesky's factorisation leaves, None where it has no digits.
+
+    GTSAM refuses some cliques of several variables of different units, whose factors have all
+    digits: then it takes one variable after another.
+
+    Parameters
+    ----------
+    gaussian : gtsam.GaussianFactorGraph
+        All factors.
+    ordering : gtsam.Ordering
+        All variables in the order of elimination.
+    """
+    for eliminate in (gaussian.eliminateMultifrontal, gaussian.eliminateSequential):
+        try:
+            return eliminate(ordering)
+        except RuntimeError:
+            continue
+    return None
+
+
+def error_of_variance(
+    gaussian: gtsam.GaussianFactorGraph,
+    information: SquareRootInformation,
+    functional: Mapping[int, Array],
+) -> float:
+    """Return the relative error of a variance by rounding, to first order.
+
+    With w the functional, x = P wᵀ from the factorisation and H the information from the factors,
+    the exact variance is w x - xᵀ (H x - wᵀ), to first order in H x - wᵀ (iterative refinement:
+    Golub and Van Loan, Matrix Computations, 4th ed., section 3.5.3).
+
+    Parameters
+    ----------
+    gaussian : gtsam.GaussianFactorGraph
+        All factors.
+    information : SquareRootInformation
+        Their factorisation.
+    functional : mapping of int to ndarray
+        The functional w, (1, size) by key.
+    """
+    x = gtsam.VectorValues()
+    for key, column in information.covariance_with([functional]).items():
+        x.insert(key, column[:, 0])
+    missing = gaussian.gradient(x).subtract(gaussian.gradientAtZero())
+    along = {key: float(w[0] @ x.at(key)) for key, w in functional.items()}
+    variance = sum(along.values())
+    return abs(x.dot(missing) - variance) / variance
+
+
 def _trees(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> Iterator[gtsam.GaussianBayesTree]:
@@ -366,24 +426,32 @@ def _trees(
     yield gaussian.eliminateMultifrontal(last, gtsam.EliminateQR)
 
 
-def _cliques_of(tree: gtsam.GaussianBayesTree, sizes: Mapping[int, int]) -> list[_Clique]:
-    """Return the cliques of a tree, each after its parent."""
+def _cliques_of(
+    tree: gtsam.GaussianBayesTree | gtsam.GaussianBayesNet, sizes: Mapping[int, int]
+) -> list[_Clique]:
+    """Return the cliques of a tree, each after its parent; of a net, one for each variable."""
+    if isinstance(tree, gtsam.GaussianBayesNet):
+        return [_clique_of(tree.at(i), sizes) for i in reversed(range(tree.size()))]
     out = []
     stack = list(tree.roots())
     while stack:
         clique = stack.pop()
-        conditional = clique.conditional()
-        own = conditional.keys()
-        R = np.array(conditional.R())
-        n = count = 0
-        while n < R.shape[0]:
-            n += sizes[own[count]]
-            count += 1
-        frontals, separators = tuple(own[:count]), tuple(own[count:])
-        T, d = np.array(conditional.S()), np.array(conditional.d())
-        out.append(_Clique(frontals, separators, R, T, d))
+        out.append(_clique_of(clique.conditional(), sizes))
         stack += [clique[i] for i in range(clique.nrChildren())]
     return out
+
+
+def _clique_of(conditional: gtsam.GaussianConditional, sizes: Mapping[int, int]) -> _Clique:
+    own = conditional.keys()
+    R = np.array(conditional.R())
+    n = count = 0
+    while n < R.shape[0]:
+        n += sizes[own[count]]
+        count += 1
+    frontals, separators = tuple(own[:count]), tuple(own[count:])
+    return _Clique(
+        frontals, separators, R, np.array(conditional.S()), np.array(conditional.d())
+    )
 
 
 def _solve(R: Array, rhs: Array, *, transposed: bool) -> Array:
