@@ -253,18 +253,20 @@ def spaced(time: Array, usable: NDArray[np.bool_], apart: float) -> NDArray[np.i
 
 def heading_error(
     time: Array, heading: Array, values: Values, zero: float
-) -> tuple[Array, dict[str, Array], Array]:
-    """Return the lasting error of a heading, (M,), rad, with its derivatives.
-
-    These are (M, n) by the name of a parameter, and (M,) by the heading.
+) -> tuple[Array, dict[str, Array]]:
+    """Return the lasting error of a heading, (M,), rad, and its derivatives, (M, n) by name.
 
         e = o + a cos w (t - t0) + b sin w (t - t0)
           + d1 sin h + d2 cos h + d3 sin 2 h + d4 cos 2 h
 
+    The deviation is that of the heading by the compass, as on a deviation card (A. Smith's
+    formula: Admiralty Manual for the Deviations of the Compass). By the true heading, it would
+    stretch the heading, and no compass tells a stretched heading from a faster turn.
+
     Parameters
     ----------
     time, heading : ndarray, shape (M,)
-        S and rad.
+        Times, s, and measured headings, rad.
     values : mapping of str to ndarray
         Heading offset o, Schuler oscillation (a, b) and deviation d by name, rad; those that are
         absent are zero.
@@ -281,14 +283,10 @@ def heading_error(
         ),
     }
     by = {name: matrix for name, matrix in by.items() if name in values}
-    total, by_heading = np.zeros((2, time.size))
+    total = np.zeros(time.size)
     for name, matrix in by.items():
         total += matrix @ values[name]
-    if DEVIATION in by:
-        d1, d2, d3, d4 = values[DEVIATION]
-        sin_1, cos_1, sin_2, cos_2 = by[DEVIATION].T
-        by_heading = d1 * cos_1 - d2 * sin_1 + 2.0 * (d3 * cos_2 - d4 * sin_2)
-    return total, by, by_heading
+    return total, by
 
 
 def dense_angles(
@@ -372,23 +370,19 @@ class AttitudeAngles(ObservationByRows):
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
-        residual, rph, by, by_heading = self._predict(motion, values)
-        by_attitude = rph_jacobian(rph, self.body_axes)
-        by_attitude[:, 2] *= 1.0 + by_heading[:, None]
+        residual, rph, by = self._predict(motion, values)
         found = {}
         for name in self.parameters:
             if name in wanted:
                 found[name] = np.zeros((*residual.shape, by[name].shape[1]))
                 found[name][:, 2] = by[name]
-        return Linearization(residual, by_attitude, d_parameters=found)
+        return Linearization(residual, rph_jacobian(rph, self.body_axes), d_parameters=found)
 
-    def _predict(
-        self, motion: Motion, values: Values
-    ) -> tuple[Array, Array, dict[str, Array], Array]:
+    def _predict(self, motion: Motion, values: Values) -> tuple[Array, Array, dict[str, Array]]:
         lat, lon, _ = self.frame.geodetic(motion.p_n)
         lRb = self.frame.level_from_tangent(lat, lon) @ motion.nRb
         rph = rph_from_rotation(lRb, self.body_axes)
         own = {name: values[name] for name in self.parameters if name in values}
-        lasting, by, by_heading = heading_error(self.time, rph[:, 2], own, 0.0)
+        lasting, by = heading_error(self.time, self.measured[:, 2], own, 0.0)
         predicted = rph + lasting[:, None] * np.array([0.0, 0.0, 1.0])
-        return wrapped(predicted - self.measured), rph, by, by_heading
+        return wrapped(predicted - self.measured), rph, by

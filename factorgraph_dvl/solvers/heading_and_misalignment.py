@@ -101,7 +101,7 @@ def _mean_error(
     """Return the mean error of the heading, rad, and its derivatives (1, n) by key."""
     measured = ~np.isnan(sensor.rph[:, _HEADING])
     time = sensor.time[measured]
-    stated, by, _ = heading_error(time, sensor.rph[measured, _HEADING], values, 0.0)
+    stated, by = heading_error(time, sensor.rph[measured, _HEADING], values, 0.0)
     weight = np.gradient(time)
     weight /= weight.sum()
     mean = float(weight @ stated)
