@@ -21,6 +21,7 @@ from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.catalogue import PLANAR, add_plug_in
+from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import BEAM_PREFIX, DvlBeams
@@ -207,6 +208,7 @@ class Trial:
                 object.__setattr__(self, "gnss", replace(self.gnss, turning=aid.turning(up)))
         self._check_planar()
         self._check_prior()
+        on_shared_clocks((p for aid in self.aids for p in aid.parameters()), self.aids)
 
     def _check_planar(self) -> None:
         """Raise ConfigError for what a track in the plane would leave out."""

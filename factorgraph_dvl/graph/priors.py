@@ -55,7 +55,7 @@ def add_priors(
     """Add the priors of parameters, those of one calibration as one factor."""
     origin = {p.name: prior_mean(p) for p in parameters}
     for group in _groups(parameters):
-        if group[0].joint is None:
+        if len(group) == 1 and group[0].joint is None:
             _add_prior(graph, group[0], key_of[group[0].name])
         else:
             gain = np.asarray(np.linalg.inv(_root_of(group)), float)
@@ -282,10 +282,16 @@ def prior_mean(p: Parameter) -> Array:
 
 
 def _groups(parameters: Sequence[Parameter]) -> list[list[Parameter]]:
-    """Return parameters in groups with a common prior."""
+    """Return parameters in groups with a common prior; those that are relative come last."""
+    by_name = {p.name: p for p in parameters}
+
+    def leading(p: Parameter) -> Parameter:
+        return p if p.relative is None else by_name.get(p.relative.to, p)
+
     groups: dict[int, list[Parameter]] = {}
-    for p in parameters:
-        groups.setdefault(id(p.joint or p), []).append(p)
+    for p in sorted(parameters, key=lambda p: leading(p) is not p):
+        first = leading(p)
+        groups.setdefault(id(first.joint or first), []).append(p)
     return list(groups.values())
 
 
@@ -301,6 +307,9 @@ def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> Non
 
 def _root_of(group: Sequence[Parameter]) -> Array:
     """Return a square root of the prior covariance of parameters in their tangent space, SI."""
+    relative = [p for p in group if p.relative is not None]
+    if relative and len(group) > 1:
+        return _relative_root(group[: -len(relative)], relative)
     sigma = np.concatenate([p.sigma for p in group])
     sigma = np.where(sigma > 0.0, sigma, _FIXED_STD)
     root = np.diag(sigma)
@@ -319,6 +328,15 @@ def _root_of(group: Sequence[Parameter]) -> Array:
         *(right_jacobian(p.mean) if p.rotation else np.eye(p.mean.size) for p in group)
     )
     return np.asarray(to_tangent @ root)
+
+
+def _relative_root(others: Sequence[Parameter], relative: Sequence[Parameter]) -> Array:
+    """Return the square root of a group in which some are relative to others: each follows one."""
+    root, place = _root_of(others), places(others)
+    own = [max(p.relative.sigma, _FIXED_STD) for p in relative if p.relative is not None]
+    follows = [root[place[p.relative.to]] for p in relative if p.relative is not None]
+    below = np.hstack([np.concatenate(follows), np.diag(own)])
+    return np.vstack([np.hstack([root, np.zeros((len(root), len(own)))]), below])
 
 
 def square_root(root: Array) -> gtsam.noiseModel.Gaussian:

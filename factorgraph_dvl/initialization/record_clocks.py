@@ -56,30 +56,34 @@ def clock_lags(
         Whether the velocities are through water that moves.
     """
     clocks = (dvl_clock, attitude_clock)
-    lags = [float(p.mean[0]) for p in clocks]
+    means, sigmas = (np.concatenate([getattr(p, n) for p in clocks]) for n in ("mean", "sigma"))
+    shared, relative = 0.0, attitude_clock.relative
+    if relative is not None and relative.to == dvl_clock.name:
+        # Of one instrument: what is searched is by how much its attitudes are late beside pings.
+        shared, sigmas[1] = 1.0, relative.sigma
+        means[1] -= means[0]
 
-    def misfit(trial: list[float]) -> float:
-        motion, known = motion_at(time - trial[0], trial[1])
+    def misfit(lags: Array) -> float:
+        motion, known = motion_at(time - lags[0], lags[1] + shared * lags[0])
         if known.sum() < _LEAST_PINGS:
             return np.inf
-        if current:
-            return _misfit_through_water(time, motion, velocity, known)
-        return _misfit(motion, velocity, known)
+        fit = (
+            _misfit_through_water(time, motion, velocity, known)
+            if current
+            else _misfit(motion, velocity, known)
+        )
+        off = (lags - means)[sigmas > 0.0] / sigmas[sigmas > 0.0]
+        return fit + 0.5 * float(off @ off)
 
+    lags = means
     for step in _STEPS:
-        for i, p in enumerate(clocks):
-            if not p.estimated:
-                continue
-            sigma = float(p.sigma[0])
-            reach = _REACH_SIGMAS * sigma if step == _STEPS[0] else 5.0 * step
+        for i in np.flatnonzero(sigmas):
+            reach = _REACH_SIGMAS * sigmas[i] if step == _STEPS[0] else 5.0 * step
             count = max(int(np.ceil(reach / step)), 1)
-            grid = lags[i] + step * np.arange(-count, count + 1)
-            costs = []
-            for lag in grid:
-                off = (lag - float(p.mean[0])) / sigma
-                costs.append(misfit([lag if j == i else lags[j] for j in range(2)]) + 0.5 * off**2)
-            lags[i] = float(grid[int(np.argmin(costs))])
-    return lags[0], lags[1]
+            along = step * np.eye(2)[i]
+            tried = [lags + k * along for k in range(-count, count + 1)]
+            lags = tried[int(np.argmin([misfit(each) for each in tried]))]
+    return float(lags[0]), float(lags[1] + shared * lags[0])
 
 
 def _misfit(motion: Motion, velocity: Array, known: np.ndarray) -> float:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
-from factorgraph_dvl.sensors.protocol import SensorSection
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec, Relative
+from factorgraph_dvl.sensors.protocol import Aid, SensorSection
 from factorgraph_dvl.settings.sections import NonNegative
 
 # Plausible offset, s, and rate, ppm, of a clock. Chosen: four times the first are the leap seconds
 # of GPS time, and the second is quartz that is broken.
 _OFFSET_S = 5.0
 _RATE_PPM = 1000.0
+# How names of offset and rate end, without the unit.
+CLOCK_STEMS = ("time_offset", "clock_rate")
 
 
 class ClockSection(SensorSection, frozen=True, kw_only=True):
-    """Section of trial.yaml of a sensor that has a clock of its own."""
+    """Section of trial.yaml of a sensor that has a clock.
 
+    Where `clock` names the section of another sensor, its stamps are by the clock of that one, and
+    the time offset is how late they are beside it.
+    """
+
+    clock: str = ""
     time_offset_s: float = 0.0
     time_offset_std_s: NonNegative = 0.0
     clock_rate_std_ppm: NonNegative = 0.0
@@ -89,3 +97,44 @@ class Clock:
         """
         offset, rate = float(values[self.offset.name][0]), float(values[self.rate.name][0])
         return offset + rate * (time - zero)
+
+
+def on_shared_clocks(parameters: Iterable[Parameter], aids: Iterable[Aid]) -> list[Parameter]:
+    """Return parameters with clocks relative to those that sensors say they are by.
+
+    Parameters
+    ----------
+    parameters : iterable of Parameter
+        Of all sensors.
+    aids : iterable of Aid
+        The sensors; the settings of each may name the section of another one as `clock`.
+
+    Raises
+    ------
+    ConfigError
+        If that sensor has no clock of its own.
+    """
+    out = {p.name: p for p in parameters}
+    clocks = {
+        aid.section: [p.name for p in aid.parameters() if p.stem.endswith(CLOCK_STEMS)]
+        for aid in aids
+    }
+    named = {aid.section: getattr(aid.settings, "clock", "") for aid in aids}
+    for section, other in named.items():
+        if not other:
+            continue
+        if not clocks.get(other) or named[other]:
+            usable = [name for name in clocks if clocks[name] and not named[name]]
+            raise ConfigError(
+                f"no sensor {other!r} has a clock of its own",
+                where=f"{section}.clock",
+                expected=f"one of {', '.join(usable)}",
+            )
+        for own, reference in zip(clocks[section], clocks[other], strict=True):
+            p, to = out[own], out[reference]
+            if to.estimated:
+                relative = Relative(reference, float(p.sigma[0]))
+                sigma = np.hypot(p.sigma, to.sigma)
+                p = replace(p, sigma=sigma, relative=relative)
+            out[own] = replace(p, mean=p.mean + to.mean)
+    return list(out.values())

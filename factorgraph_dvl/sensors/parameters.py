@@ -184,6 +184,22 @@ class JointPrior:
 
 
 @dataclass(frozen=True)
+class Relative:
+    """The prior of a parameter relative to another one, of one component each.
+
+    Parameters
+    ----------
+    to : str
+        Name of the other parameter.
+    sigma : float, SI
+        Standard deviation of the difference.
+    """
+
+    to: str
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A constant of a sensor that the solver estimates, with its prior.
 
@@ -196,6 +212,8 @@ class Parameter:
         rotation, `mean` is the rotation vector and `sigma` that of its components.
     joint : JointPrior, optional
         The calibration of several parameters that mean and sigma come from.
+    relative : Relative, optional
+        What its prior is relative to: another parameter.
     nominal : ndarray, shape (N, 3), optional
         Nominal directions: unit vectors in body, which the components turn, two each. Files
         contain the directions.
@@ -205,6 +223,7 @@ class Parameter:
     mean: Array
     sigma: Array
     joint: JointPrior | None = None
+    relative: Relative | None = None
     nominal: Array | None = None
 
     @cached_property

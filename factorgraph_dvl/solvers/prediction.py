@@ -22,6 +22,7 @@ from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Solution
@@ -170,7 +171,8 @@ def _with_imu(trial: Trial, true_states: TrueStates) -> _Planned:
     accel = trial.calibration_truth.get("accel_bias_ug", none) * MICRO_G
     states = States(motion.nRb, motion.p_n, motion.v_n, zero + gyro, zero + accel)
     observations, parameters = observed(trial.aids, frame, trial.body_axes)
-    parameters = (*parameters, *trial.inertial.error_parameters())
+    clocks = on_shared_clocks(parameters, trial.aids)
+    parameters = (*clocks, *trial.inertial.error_parameters())
     chain = inertial_chain(trial, frame, seg, states)
     return _Planned(chain, states, _true_values(trial, parameters), observations, parameters)
 

@@ -25,6 +25,7 @@ from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
+from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.solution import Progress
@@ -220,7 +221,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         segments=seg,
         observations=tuple(o for _, observations, _ in by_aid for o in observations),
         parameters=(
-            *(p for _, _, parameters in by_aid for p in parameters),
+            *on_shared_clocks((p for _, _, own in by_aid for p in own), trial.aids),
             *trial.inertial.error_parameters(),
         ),
         estimated_noise=frozenset(

@@ -26,6 +26,7 @@ from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.attitude import Attitude
+from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
@@ -386,7 +387,7 @@ def _parameters(trial: Trial) -> tuple[Parameter, ...]:
         for p in aid.parameters():
             reference = aid.section == section and p.stem.endswith(("time_offset", "clock_rate"))
             out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
-    return tuple(out)
+    return tuple(on_shared_clocks(out, trial.aids))
 
 
 def _start_values(

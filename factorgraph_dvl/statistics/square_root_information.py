@@ -449,9 +449,7 @@ def _clique_of(conditional: gtsam.GaussianConditional, sizes: Mapping[int, int])
         n += sizes[own[count]]
         count += 1
     frontals, separators = tuple(own[:count]), tuple(own[count:])
-    return _Clique(
-        frontals, separators, R, np.array(conditional.S()), np.array(conditional.d())
-    )
+    return _Clique(frontals, separators, R, np.array(conditional.S()), np.array(conditional.d()))
 
 
 def _solve(R: Array, rhs: Array, *, transposed: bool) -> Array:

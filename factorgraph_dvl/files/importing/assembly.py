@@ -31,6 +31,8 @@ _BIAS = [0.005, 0.005, 0.005]
 # Chosen: clocks that are related by when sentences arrived, without an IMU that would relate them
 # better, and the latency of instruments, s.
 _LATENCY = 2.0
+# Chosen: latency of a compass beside the pings of the same instrument, s: filters and means.
+_SAME_INSTRUMENT = 0.5
 # Chosen: how long errors of attitude sensors and compasses stay alike, s.
 _ATTITUDE_CORRELATION = 300.0
 
@@ -109,9 +111,9 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         _add_gnss(out, gnss, imu is not None or ins is not None)
     if ins is not None:
         _add_ins(out, ins, motion.choose(streams, "ins_std", decisions))
-    if attitude is not None:
-        _add_attitude(out, attitude)
     log = velocity.choose(streams, decisions)
+    if attitude is not None:
+        _add_attitude(out, attitude, None if log is None else log.section)
     if log is not None:
         if not axes and imu is None and ins is None and log.axes:
             # A heading alone has no axes.
@@ -231,7 +233,10 @@ def _add_ins(out: Assembly, ins: Merged, deviations: Merged | None) -> None:
     out.add("ins", navigation.tables, **keys)
 
 
-def _add_attitude(out: Assembly, attitude: orientation.ImportedAttitude) -> None:
+def _add_attitude(
+    out: Assembly, attitude: orientation.ImportedAttitude, section: str | None
+) -> None:
+    """Add attitudes; those of the instrument that pings have its clock, its `section`."""
     keys: dict[str, Any] = {
         "std_deg": [float(value) for value in attitude.std],
         "correlation_time_s": _ATTITUDE_CORRELATION,
@@ -249,6 +254,14 @@ def _add_attitude(out: Assembly, attitude: orientation.ImportedAttitude) -> None
             attitude.attitude.label,
             "the deviation of a magnetic compass depends on the heading → estimated",
             "attitude.deviation_std_deg",
+        )
+    if attitude.own and section is not None:
+        keys["clock"], keys["time_offset_std_s"] = section, _SAME_INSTRUMENT
+        out.decisions.add(
+            attitude.attitude.label,
+            "the attitude sensors are in the DVL → one clock; how late they may be beside the "
+            "pings, chosen",
+            "attitude.clock",
         )
     out.add("attitude", attitude.tables, **keys)
 
