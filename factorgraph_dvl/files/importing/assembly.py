@@ -31,8 +31,8 @@ _BIAS = [0.005, 0.005, 0.005]
 # Chosen: clocks that are related by when sentences arrived, without an IMU that would relate them
 # better, and the latency of instruments, s.
 _LATENCY = 2.0
-# Chosen: latency of a compass beside the pings of the same instrument, s: filters and means.
-_SAME_INSTRUMENT = 0.5
+# Chosen: latency of attitudes beside other records by the same clock, s: filters and means.
+_SAME_CLOCK = 1.0
 # Chosen: how long errors of attitude sensors and compasses stay alike, s.
 _ATTITUDE_CORRELATION = 300.0
 
@@ -113,7 +113,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         _add_ins(out, ins, motion.choose(streams, "ins_std", decisions))
     log = velocity.choose(streams, decisions)
     if attitude is not None:
-        _add_attitude(out, attitude, None if log is None else log.section)
+        _add_attitude(out, attitude, _clock_of(attitude, log, gnss))
     if log is not None:
         if not axes and imu is None and ins is None and log.axes:
             # A heading alone has no axes.
@@ -233,10 +233,24 @@ def _add_ins(out: Assembly, ins: Merged, deviations: Merged | None) -> None:
     out.add("ins", navigation.tables, **keys)
 
 
+def _clock_of(
+    attitude: orientation.ImportedAttitude,
+    log: velocity.Velocities | None,
+    gnss: positions.Positions | None,
+) -> tuple[str, str]:
+    """Return the section whose clock attitudes have, and why; empty if they have their own."""
+    if attitude.own:
+        return ("", "") if log is None else (log.section, "the attitude sensors are in the DVL")
+    own = attitude.attitude.streams[0].stream
+    fixes = None if gnss is None else gnss.fixes.streams[0].stream
+    if fixes is not None and (own.file, own.clock) == (fixes.file, fixes.clock):
+        return "gnss", "the headings come with the fixes"
+    return "", ""
+
+
 def _add_attitude(
-    out: Assembly, attitude: orientation.ImportedAttitude, section: str | None
+    out: Assembly, attitude: orientation.ImportedAttitude, clock: tuple[str, str]
 ) -> None:
-    """Add attitudes; those of the instrument that pings have its clock, its `section`."""
     keys: dict[str, Any] = {
         "std_deg": [float(value) for value in attitude.std],
         "correlation_time_s": _ATTITUDE_CORRELATION,
@@ -255,12 +269,12 @@ def _add_attitude(
             "the deviation of a magnetic compass depends on the heading → estimated",
             "attitude.deviation_std_deg",
         )
-    if attitude.own and section is not None:
-        keys["clock"], keys["time_offset_std_s"] = section, _SAME_INSTRUMENT
+    section, why = clock
+    if section:
+        keys["clock"], keys["time_offset_std_s"] = section, _SAME_CLOCK
         out.decisions.add(
             attitude.attitude.label,
-            "the attitude sensors are in the DVL → one clock; how late they may be beside the "
-            "pings, chosen",
+            f"{why} → one clock; how late they may be beside it, chosen",
             "attitude.clock",
         )
     out.add("attitude", attitude.tables, **keys)
