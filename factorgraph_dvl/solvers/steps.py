@@ -33,7 +33,7 @@ from factorgraph_dvl.solvers.imu_noise import lower_noise
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated, Model
-from factorgraph_dvl.solvers.motion_strengths import Strengths
+from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
 from factorgraph_dvl.solvers.outliers import robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
@@ -101,6 +101,8 @@ class MotionStrengths:
 
     name = "strengths of motion and noise"
     _settled_for: tuple[Any, ...] | None = None
+    # Objective from which it last asked for another estimate.
+    _asked_at: float = np.inf
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield strengths that the residuals ask for, and others on the way there."""
@@ -113,8 +115,13 @@ class MotionStrengths:
         if found is None:
             self._settled_for = own
             return
+        if self._asked_at - at.objective < LEAST_GAIN:
+            # What one strength gains, others may lose, for ever.
+            found = replace(found, same=True)
+        self._asked_at = at.objective
         if found.same:
             self._settled_for = own
+            self._asked_at = np.inf
         for share in _SHARES:
             yield _with_strengths(model, found, share)
 
