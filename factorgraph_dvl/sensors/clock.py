@@ -105,7 +105,7 @@ def on_shared_clocks(parameters: Iterable[Parameter], aids: Iterable[Aid]) -> li
     Parameters
     ----------
     parameters : iterable of Parameter
-        Of all sensors.
+        Parameters of all sensors.
     aids : iterable of Aid
         The sensors; the settings of each may name the section of another one as `clock`.
 

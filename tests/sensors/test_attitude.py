@@ -54,7 +54,8 @@ def test_attitude_is_that_of_the_body_and_the_error_of_the_heading(motion):
 def test_derivatives_are_those_of_the_residual(motion):
     sensor = compass()
     (angles,) = sensor.observations(FRAME, "FRD")
-    check_jacobians(angles, motion, VALUES, sensor.parameters()[:3], tolerance=1e-5)
+    # The rate of a clock moves the samples by minutes, so that its differences are curved.
+    check_jacobians(angles, motion, VALUES, sensor.parameters()[:3], tolerance=5e-5)
 
 
 def test_samples_with_one_error_count_once_beside_an_imu():
