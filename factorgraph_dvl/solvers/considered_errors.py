@@ -8,7 +8,7 @@ ch. VIII). With whitened rows J of the graph that change by B, K = -P Jᵀ B.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
+from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # IMU factors that are read at once. Chosen: some ten megabytes.
@@ -54,25 +56,56 @@ def considered_errors(
     information : SquareRootInformation
         Information on all variables there.
     """
+    found: list[tuple[str, str, dict[int, Array]]] = []
     chain = problem.chain
-    if not isinstance(chain, InertialChain) or chain.imu.gravity_deflection_std_arcsec == 0.0:
-        return ()
-    std = chain.imu.gravity_deflection_std_arcsec
-    by_key = information.covariance_with([_by_deflection(chain, problem, evaluation)])
-    changes = {key: -std * ARCSEC * change for key, change in by_key.items()}
-    return (ConsideredError("deflection of the vertical", f'{std:g}″', changes),)
+    if isinstance(chain, InertialChain) and chain.imu.gravity_deflection_std_arcsec > 0.0:
+        std = chain.imu.gravity_deflection_std_arcsec
+        sums = _by_deflection(chain, problem, evaluation, std * ARCSEC)
+        found.append(("deflection of the vertical", f"{std:g}″", sums))
+    for label, sums in _by_offsets(problem, evaluation):
+        found.append((f"slow errors of {label}", "all that residuals do not show", sums))
+    out = []
+    for cause, assumed, sums in found:
+        by_key = information.covariance_with([sums])
+        changes = {key: -change for key, change in by_key.items()}
+        out.append(ConsideredError(cause, assumed, changes))
+    return tuple(out)
+
+
+def _by_offsets(
+    problem: Problem, evaluation: Evaluation
+) -> Iterator[tuple[str, dict[int, Array]]]:
+    """Yield Bᵀ J of positions by an offset of each component, (h, size) by key, with the label.
+
+    It is what the stated deviation has more than residuals show: an error that persists, which
+    the trajectory follows.
+    """
+    unseen = unseen_offsets(problem)
+    if not unseen:
+        return
+    # Of the deviation that rows are weighed by.
+    columns = {
+        label: np.diag(share / problem.white_factors[label])[:, share > 0.0]
+        for label, share in unseen.items()
+    }
+    found: dict[str, dict[int, Array]] = {label: {} for label in unseen}
+    for rows in problem.observation_rows(evaluation):
+        if rows.source in found:
+            used = np.any(rows.matrix, axis=2)[:, :, None]
+            add_transposed_product(rows, used * columns[rows.source], found[rows.source])
+    yield from found.items()
 
 
 def _by_deflection(
-    chain: InertialChain, problem: Problem, evaluation: Evaluation
+    chain: InertialChain, problem: Problem, evaluation: Evaluation, std: float
 ) -> dict[int, Array]:
-    """Return Bᵀ J of the IMU factors by the components of the deflection, (h, size) by key.
+    """Return Bᵀ J of the IMU factors by the components of a deflection, (h, size) by key.
 
     A deflection tilts gravity: the state that is predicted at the end of a segment moves.
     """
     seg, states = chain.segments, evaluation.states
     middle = 0.5 * (states.p_n[seg.origin] + states.p_n[seg.origin + 1])
-    along = STANDARD_GRAVITY * deflection_along(middle[:, :2])
+    along = std * STANDARD_GRAVITY * deflection_along(middle[:, :2])
     duration = seg.duration[:, None, None]
     pushed = states.nRb[seg.origin + 1, :2].transpose(0, 2, 1) @ along * duration
     moved = np.concatenate([np.zeros_like(pushed), 0.5 * duration * pushed, pushed], axis=1)

@@ -1,4 +1,4 @@
-"""Errors that nobody estimates: what they change, and what they add to standard deviations."""
+"""Errors that are not estimated: what they change, and what they add to standard deviations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from truth import CONFIGS, TURNING, scenario
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
 from factorgraph_dvl.geometry.units import ARCSEC
 from factorgraph_dvl.simulation import parse_scenario, simulate
-from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.batch import solve, solved_problems
+from factorgraph_dvl.solvers.considered_errors import considered_errors
+from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
+from factorgraph_dvl.solvers.levenberg_marquardt import minimise
+from factorgraph_dvl.solvers.posterior import of_states
 
 CAUSE = "deflection of the vertical"
 
@@ -69,3 +73,47 @@ def test_attitudes_at_navigation_grade_hold_their_standard_deviations():
     for values, freedom in ((nees, 3), (of_mount, 7)):
         low, high = chi2.ppf([0.005, 0.995], freedom * RUNS)
         assert low < sum(values) < high, np.round(np.array(values) / freedom, 2)
+
+
+def test_what_residuals_do_not_show_of_positions_moves_the_trajectory_and_nothing_else():
+    found = solved_problems(turning(0.0, 0.0))[0]
+    problem, evaluation = found.problem, found.minimum.evaluation
+    problem.processes = ()
+    problem.noise_factors = {"GNSS position": np.array([0.6, 0.6, 1.0])}
+    problem.weigh(evaluation)
+    minimum = minimise(problem, evaluation.values, stage="as weighed", weighed=True)
+    (error,) = considered_errors(problem, minimum.evaluation, minimum.information)
+    assert error.cause == "slow errors of GNSS position"
+    change = of_states(problem.chain, error.changes)
+    moved = minimum.evaluation.states.nRb @ change[:, 3:6]
+    # As far as the fixes: 0.8 of what is stated of each.
+    expected = np.array([[0.4, 0.0], [0.0, 0.4], [0.0, 0.0]])
+    np.testing.assert_allclose(moved @ moved.transpose(0, 2, 1), np.broadcast_to(
+        expected @ expected.T, (len(moved), 3, 3)), atol=1e-3)  # fmt: skip
+    assert np.abs(change[:, :3]).max() < 1e-6
+    assert np.abs(change[:, 6:]).max() < 1e-4
+    sigma = np.sqrt(np.diag(found.covariances.parameters))
+    moved = np.concatenate([error.changes[problem.key(p.name)] for p in problem.parameters])
+    in_priors = np.linalg.solve(problem.prior_root, moved)
+    assert np.all(np.abs(in_priors) < 0.05 * sigma[:, None])
+    # Noise that is as stated, and noise that is found to persist, leave nothing.
+    problem.noise_factors = {"GNSS position": np.ones(3)}
+    assert not unseen_offsets(problem)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", [15.0, 100.0, 600.0])
+def test_positions_hold_their_standard_deviations_under_slow_errors(tau):
+    plan = yaml.safe_load((CONFIGS / "data-sheet-mix-tactical.yaml").read_text(encoding="utf-8"))
+    plan["imu"]["time_offset_s"] = 0
+    plan["gnss"] |= {"position_std_m": [0.02, 0.02, 0.04], "correlation_time_s": tau}
+    nees, squares, inside = [], [], []
+    for seed in range(RUNS):
+        trial = simulate(parse_scenario(plan), seed)
+        position = trajectory_errors(solve(trial, rate_hz=1.0), trial.reference).position
+        nees.append(position.nees.mean() / 3.0)
+        squares.append(np.mean(position.normalised**2, axis=0))
+        inside.append(np.mean(np.abs(position.normalised) < 2.0, axis=0))
+    assert np.mean(nees) < 2.0, np.round(nees, 2)
+    assert np.mean(inside, axis=0).min() > 0.9, np.round(inside, 2)
+    assert np.sqrt(np.mean(squares)) > 0.6, np.round(squares, 2)
