@@ -15,7 +15,6 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solvers.known_parameters import wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
@@ -119,19 +118,6 @@ def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Find
             text = message("averaging.found", sensor=label, length=length, std=std)
             out.append(Finding(Code.AVERAGING, text, sensor=label, parameter=p.name))
     return tuple(out)
-
-
-def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
-    """Return findings of windows that sensors state, where each ping counts as instantaneous."""
-    return [
-        Finding(
-            Code.ERROR_LEFT_OUT,
-            message("error_left_out.window", section=aid.section),
-            sensor=aid.label,
-        )
-        for aid in aids
-        if "averaging_s" in aid.settings.left_out
-    ]
 
 
 def _length(bound: BoundObservation) -> str:
