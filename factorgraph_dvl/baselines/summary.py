@@ -18,7 +18,12 @@ from factorgraph_dvl.geometry.rotations import rph_from_rotation, rph_jacobian, 
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.results import consistency_findings, contradictions, not_observable
+from factorgraph_dvl.quality.results import (
+    consistency_findings,
+    contradictions,
+    not_observable,
+    windows_left_out,
+)
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
@@ -217,16 +222,20 @@ def gnss_residuals(trial: Trial, navigation: Navigation) -> tuple[Residuals, ...
 
 
 def left_out(sensor: Aid, outside: int, vague: int) -> list[Finding]:
-    """Say how many pings of a sensor were not used, and why: outside the motion, or vague."""
+    """Say how many pings of a sensor were not used, and why, and that a window is left out.
+
+    They are outside the motion, or vague.
+    """
     reasons = {
         "unused.pings_outside": outside,
         "unused.pings_vague": vague,
     }
-    return [
+    unused = [
         Finding(Code.UNUSED, message(key, count=pings), sensor=sensor.label)
         for key, pings in reasons.items()
         if pings
     ]
+    return [*windows_left_out([sensor]), *unused]
 
 
 def _unobservable(

@@ -6,6 +6,7 @@ one for a measurement.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -307,7 +308,7 @@ def sensor_factor(
     Its variables are the `NavState` at node k, the `ConstantBias` of the IMU, and those
     calibration parameters that have a key: a `Rot3` for a rotation, else a vector, SI. It works
     in any graph, and GTSAM's own optimisers and `Marginals` take it. The other parameters are
-    fixed at their prior means.
+    fixed at their prior means. Each measurement counts as instantaneous.
 
     Parameters
     ----------
@@ -332,6 +333,11 @@ def sensor_factor(
         If nothing was measured there; see `measured_nodes`.
     KeyError
         If a parameter that has a key is none of the sensor's.
+
+    Warns
+    -----
+    UserWarning
+        If the sensor averages over a window, which the factor leaves out.
 
     Examples
     --------
@@ -362,6 +368,9 @@ def sensor_factor(
     if unknown:
         raise KeyError(f"{', '.join(sorted(unknown))}: no parameter of the sensor")
     fixed = {p.name: prior_mean(p) for p in parameters}
+    if np.any(fixed.get(observation.averaging or "", 0.0)):
+        text = f"{observation.label}: the factor leaves out the window over which it averages"
+        warnings.warn(text, stacklevel=2)
     free = tuple(p for p in parameters if p.name in keys)
     given = {**fixed, **{p.name: value_at(values, keys[p.name], p) for p in free}}
     node = nodes_before(observation, chain, given, clock_zero)

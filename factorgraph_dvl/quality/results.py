@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.scale_causes import scale_cause
+from factorgraph_dvl.sensors.protocol import Aid
 
 # Factors by which residuals are larger than stated from which on every standard deviation is too
 # small, and the model another than the data's. Chosen: sums of some hundred residuals stay below
@@ -280,4 +281,17 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
                 apart=apart,
             ),
         )
+    ]
+
+
+def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
+    """Return findings of windows that sensors state, where each ping counts as instantaneous."""
+    return [
+        Finding(
+            Code.ERROR_LEFT_OUT,
+            message("error_left_out.window", section=aid.section),
+            sensor=aid.label,
+        )
+        for aid in aids
+        if "averaging_s" in aid.settings.left_out
     ]

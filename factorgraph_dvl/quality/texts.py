@@ -21,6 +21,7 @@ _CAUSES = {
     "noise of ": "噪声",
     "correlated noise of ": "相关噪声",
     "lasting errors of ": "的持续误差",
+    "slow errors of ": "的慢变误差",
     "prior of ": "的先验",
     "random walk of ": "的随机游走",
 }

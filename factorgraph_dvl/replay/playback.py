@@ -14,7 +14,11 @@ from factorgraph_dvl.message import message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
 from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.results import consistency_findings, not_observable
+from factorgraph_dvl.quality.results import (
+    consistency_findings,
+    not_observable,
+    windows_left_out,
+)
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord, Update
 from factorgraph_dvl.replay.samples import LEAST
@@ -22,7 +26,6 @@ from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Calibration, Progress, Solution
-from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.trial import Trial
 
 # What holds only until something else is said.

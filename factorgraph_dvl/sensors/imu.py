@@ -245,6 +245,7 @@ class ImuSettings(SensorSection, frozen=True, kw_only=True):
     gyro_g_sensitivity_std_deg_h_g: NonNegative = _NOT_STATED
     accel_scale_std_ppm: NonNegative = _NOT_STATED
     accel_misalignment_std_deg: NonNegative = _NOT_STATED
+    gravity_deflection_std_arcsec: NonNegative = 10.0
 
     def __post_init__(self) -> None:
         typical = {} if isinstance(self.grade, UnsetType) else TYPICAL[self.grade]

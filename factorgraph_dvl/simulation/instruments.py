@@ -164,6 +164,7 @@ class ImuTruth(ClockedInstrument, frozen=True, kw_only=True):
     accel_scale_std_ppm: Positive | None = None
     accel_misalignment_deg: Vector3 | Draw = (0.0, 0.0, 0.0)
     accel_misalignment_std_deg: Positive | None = None
+    gravity_deflection_std_arcsec: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -179,6 +180,7 @@ class ImuTruth(ClockedInstrument, frozen=True, kw_only=True):
             "accel_noise_ug_sqrt_hz",
             "accel_bias_walk_ug_sqrt_h",
             "accel_bias_std_ug",
+            "gravity_deflection_std_arcsec",
             *self.matrices.values(),
         )
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}

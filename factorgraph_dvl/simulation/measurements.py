@@ -18,6 +18,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
+from factorgraph_dvl.simulation.gravity import force_by_deflection
 from factorgraph_dvl.simulation.instruments import (
     DvlTruth,
     GnssTruth,
@@ -41,7 +42,7 @@ def simulate_imu(
     """
     truth = scenario.imu
     assert truth is not None
-    jitter_rng, bias_rng, walk_rng, noise_rng = rng.spawn(4)
+    jitter_rng, bias_rng, walk_rng, noise_rng, gravity_rng = rng.spawn(5)
     # The interval of the first sample must not begin before the motion.
     bounds = sample_times(truth, motion.duration, jitter_rng, first=0)
     time, interval = bounds[1:], np.diff(bounds)
@@ -55,6 +56,9 @@ def simulate_imu(
         gyro, accel = _mean_samples(motion, bounds)
     else:
         gyro, accel = _instantaneous_samples(motion, time)
+    if scenario.noise and truth.gravity_deflection_std_arcsec > 0.0:
+        middle = time - 0.5 * interval if truth.sampling == "mean" else time
+        accel += force_by_deflection(scenario, motion, middle, gravity_rng)
 
     biases = {}
     for name, samples, unit, constant, std, walk, noise in (

@@ -52,6 +52,9 @@ def calibration(found: SolvedProblem) -> tuple[tuple[Estimate, ...], Array]:
     joint = covariances.information.covariance_of(functionals)
     spread = _spread(found, free, joint)
     joint = joint + spread @ spread.T
+    for error in covariances.errors:
+        change = changes_of(functionals, error.changes)
+        joint = joint + change @ change.T
     return estimates_of([(p, value) for p, value, _ in rows], joint)
 
 
@@ -107,12 +110,27 @@ def prior_along(
     spread = problem.prior_root @ fixed
     by_key = {problem.key(name): spread[place] for name, place in problem.columns.items()}
     by_key |= considered
+    if not by_key:
+        return np.zeros((sum(next(iter(f.values())).shape[0] for f in functionals), 0))
+    return changes_of(functionals, by_key)
+
+
+def changes_of(functionals: Sequence[dict[int, Array]], changes: Mapping[int, Array]) -> Array:
+    """Return how functionals change with components, (n, h), from how variables do.
+
+    Parameters
+    ----------
+    functionals : sequence of dict of int to ndarray
+        Derivatives of the functionals with respect to variables, by key.
+    changes : mapping of int to ndarray
+        Change of variables, (size, h) by key; what has none does not change.
+    """
+    width = next(iter(changes.values())).shape[1]
     parts = []
     for functional in functionals:
-        rows = next(iter(functional.values())).shape[0]
-        part = np.zeros((rows, fixed.shape[1]))
+        part = np.zeros((next(iter(functional.values())).shape[0], width))
         for key, matrix in functional.items():
-            if key in by_key:
-                part += matrix @ by_key[key]
+            if key in changes:
+                part += matrix @ changes[key]
         parts.append(part)
     return np.concatenate(parts)

@@ -159,10 +159,36 @@ def _unseen(
     for group in set(o.noise_groups).difference(found):
         own = residuals[:, list(group)]
         count = int(np.isfinite(own).sum())
-        lack = 1.0 - float(np.nansum(own**2)) / max(count, 1)
-        if count and lack > _SURE * np.sqrt(2.0 / count):
-            missing[list(group)] = np.sqrt(lack)
+        missing[list(group)] = _lack(float(np.nansum(own**2)) / max(count, 1), count)
     return missing
+
+
+def _lack(shown: float, count: int) -> float:
+    """Return which share of a deviation a variance lacks that so many residuals show of it."""
+    lack = 1.0 - shown
+    return float(np.sqrt(lack)) if count and lack > _SURE * np.sqrt(2.0 / count) else 0.0
+
+
+def unseen_offsets(problem: Problem) -> dict[str, Array]:
+    """Return which share of a position's stated deviation no residual shows, (d,) by label.
+
+    Where neither white noise nor a process explains it, the trajectory follows it.
+    """
+    out = {}
+    for o, weight in zip(problem.observations, problem.weights, strict=True):
+        factor = problem.noise_factors.get(o.label)
+        if factor is None or o.correlated is None or o.unit != "m":
+            continue
+        persists = [p.sigma for p in problem.processes if p.label == o.label]
+        share = np.zeros(factor.size)
+        for group in o.noise_groups:
+            own = list(group)
+            count = int(np.count_nonzero(weight[:, own]))
+            if not any(sigma[own].any() for sigma in persists):
+                share[own] = _lack(float(np.mean(factor[own] ** 2)), count)
+        if share.any():
+            out[o.label] = share
+    return out
 
 
 def _with_unseen(

@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
-from factorgraph_dvl.solvers.calibration import reported, spread_of_fixed
+from factorgraph_dvl.solvers.calibration import changes_of, reported, spread_of_fixed
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.rows import CORRELATED, product, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -45,9 +45,13 @@ def causes(
     spread = spread_of_fixed(found)
     if spread.size:
         variances["directions that the data do not determine"] = np.sum(spread**2, axis=1)
+    for error in found.covariances.errors:
+        change = changes_of(functionals, error.changes)
+        variances[error.cause] = np.sum(change**2, axis=1)
     is_free = np.concatenate([np.full(v.size, d is not None) for _, v, d in rows])
     exact = np.concatenate([p.sigma == 0.0 for p, _, _ in rows])
     assumed = _assumed(found, [p for p, _, _ in rows])
+    assumed |= {error.cause: error.assumed for error in found.covariances.errors}
     names = _names(problem)
     out = []
     for source, variance in variances.items():

@@ -12,8 +12,15 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.solution import SolverStep
+from factorgraph_dvl.solvers.considered_errors import considered_errors
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
-from factorgraph_dvl.solvers.posterior import Posterior, changes_with, considered, posterior
+from factorgraph_dvl.solvers.posterior import (
+    Posterior,
+    changes_with,
+    considered,
+    posterior,
+    with_errors,
+)
 from factorgraph_dvl.statistics.undetermined_directions import (
     at_prior_along,
     data_information,
@@ -107,6 +114,8 @@ def with_covariances(
         minimum = minimise_again(problem.values(evaluation.states, origin))
         covariances = considered(problem.chain, posterior(problem, minimum), changes)
         spurious = None
+    errors = considered_errors(problem, minimum.evaluation, covariances.information)
+    covariances = with_errors(problem.chain, covariances, errors)
     return SolvedProblem(problem, minimum, covariances, fixed, findings, spurious)
 
 

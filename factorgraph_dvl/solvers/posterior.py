@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.solvers.considered_errors import ConsideredError
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -40,6 +41,8 @@ class Posterior:
         Covariance of states and biases with them, (size, P) by key.
     considered : dict of int to ndarray
         K of states and biases, (size, h) by key; empty where nothing is fixed.
+    errors : tuple of ConsideredError, optional
+        Other errors that are not estimated; their K Kᵀ is in `nodes`.
     """
 
     information: SquareRootInformation
@@ -48,6 +51,7 @@ class Posterior:
     parameters: Array
     with_parameters: dict[int, Array]
     considered: dict[int, Array]
+    errors: tuple[ConsideredError, ...] = ()
 
 
 def posterior(problem: Problem, minimum: Minimum) -> Posterior:
@@ -97,3 +101,12 @@ def considered(chain: Chain, found: Posterior, changes: dict[int, Array]) -> Pos
     return replace(
         found, nodes=found.nodes + change @ change.transpose(0, 2, 1), considered=changes
     )
+
+
+def with_errors(chain: Chain, found: Posterior, errors: Sequence[ConsideredError]) -> Posterior:
+    """Return covariances with what errors that are not estimated add."""
+    nodes = found.nodes
+    for error in errors:
+        change = of_states(chain, error.changes)
+        nodes = nodes + change @ change.transpose(0, 2, 1)
+    return replace(found, nodes=nodes, errors=(*found.errors, *errors))

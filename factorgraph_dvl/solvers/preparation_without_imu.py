@@ -25,6 +25,7 @@ from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.ins import Ins
@@ -32,7 +33,6 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths

@@ -220,7 +220,8 @@ def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None
         )
         iterations += found.minimum.iterations
         # An objective is that of a minimum: where one was not reached, it is still open.
-        if found.objective < at.objective or (at.rough and proposal.model is at.model):
+        least = at.objective - proposal.least_fall
+        if found.objective < least or (at.rough and proposal.model is at.model):
             return found, iterations
     if not at.model.is_applied(at.problem):
         at.model.applied(at.problem)

@@ -71,12 +71,15 @@ class Proposal:
         States of the nodes, and values of all parameters.
     rough : bool, default False
         Whether the minimisation may end early, as another one follows.
+    least_fall : float, default 0
+        Fall of the objective below which it is not kept.
     """
 
     model: Model
     states: Any
     values: dict[str, Array]
     rough: bool = False
+    least_fall: float = 0.0
 
 
 class Step(Protocol):
@@ -176,15 +179,16 @@ class Averaging:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the length of a window, where the data show one."""
         model = at.model
-        if model.parameters is self._tested or at.rough or at.problem.chain.interpolates:
+        # Noise that persists is a part of the misfit until it is known.
+        own = model.parameters, _labels(model)
+        if _are_those(own, self._tested) or at.rough or at.problem.chain.interpolates:
             return
-        self._tested = model.parameters
+        self._tested = own
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
-        free = {p.name: wide(p, p.mean) for p in found}
-        parameters = tuple(free.get(p.name, p) for p in model.parameters)
-        yield _from(at, parameters=parameters)
+        parameters = tuple(wide(p, p.mean) if p.name in found else p for p in model.parameters)
+        yield replace(_from(at, parameters=parameters), least_fall=sum(found.values()))
 
 
 @dataclass

@@ -202,3 +202,10 @@ def test_command_line(tmp_path, capsys):
     assert run(*wahba) == 1
     assert "the model does not fit the data" in capsys.readouterr().err
     assert (tmp_path / "z" / "calibration.json").exists()
+
+
+def test_a_window_that_is_left_out_is_said():
+    claims = {"dvl": {"averaging_s": 0.5}}
+    trial = simulate(scenario(manoeuvres=VARIED[:2], trial=claims, imu={"rate_hz": 50}))
+    (found,) = of_code(kalman(trial, "wahba").findings, Code.ERROR_LEFT_OUT)
+    assert "dvl.averaging_s" in found

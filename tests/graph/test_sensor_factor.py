@@ -301,6 +301,18 @@ def test_a_factor_without_measurements_and_an_unknown_parameter_are_refused():
         sensor_factor(velocity, parameters, chain, 2, named | {"arm": 1}, values)
 
 
+def test_a_factor_says_that_it_leaves_a_window_out():
+    trial = simulate(scenario(dvl={"averaging_s": 0.5}, trial={"dvl": {"averaging_s": 0.5}}))
+    frame = trial.frame()
+    chain = preintegrate(trial.imu, np.arange(10.0, 12.0), frame)
+    (velocity,) = trial.dvl.observations(frame, trial.body_axes)
+    values = gtsam.Values()
+    values.insert(1, gtsam.NavState())
+    values.insert(2, gtsam.imuBias.ConstantBias())
+    with pytest.warns(UserWarning, match="window"):
+        sensor_factor(velocity, trial.dvl.parameters(), chain, 0, {"state": 1, "bias": 2}, values)
+
+
 def test_nodes_that_the_imu_does_not_cover_are_refused():
     trial = simulate(scenario())
     frame = trial.frame()

@@ -14,8 +14,8 @@ from truth import CONFIGS
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
-from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.solvers.batch import solve
 
 MOUNT = (

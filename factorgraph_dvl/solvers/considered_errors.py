@@ -1,0 +1,125 @@
+"""Errors that are not estimated, and by how much they move every variable.
+
+The estimate is that without them, and what depends on them has a covariance P + K Kᵀ, with K its
+change with each of their components, which are independent and of unit variance (Schmidt's
+consider analysis; Bierman, Factorization Methods for Discrete Sequential Estimation, 1977,
+ch. VIII). With whitened rows J of the graph that change by B, K = -P Jᵀ B.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from factorgraph_dvl.geometry.deflection import deflection_along
+from factorgraph_dvl.geometry.units import ARCSEC, STANDARD_GRAVITY
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.inertial_chain import InertialChain
+from factorgraph_dvl.graph.keys import STATE_SIZE
+from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
+from factorgraph_dvl.statistics.rows import add_transposed_product
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# IMU factors that are read at once. Chosen: some ten megabytes.
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class ConsideredError:
+    """An error that is not estimated.
+
+    Parameters
+    ----------
+    cause, assumed : str
+        Row of the error budget.
+    changes : mapping of int to ndarray
+        Change of every variable with each component, (size, h) by key.
+    """
+
+    cause: str
+    assumed: str
+    changes: Mapping[int, Array]
+
+
+def considered_errors(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> tuple[ConsideredError, ...]:
+    """Return the errors of a problem that are considered.
+
+    Parameters
+    ----------
+    problem, evaluation : Problem or Evaluation
+        Problem, and its minimum.
+    information : SquareRootInformation
+        Information on all variables there.
+    """
+    found: list[tuple[str, str, dict[int, Array]]] = []
+    chain = problem.chain
+    if isinstance(chain, InertialChain) and chain.imu.gravity_deflection_std_arcsec > 0.0:
+        std = chain.imu.gravity_deflection_std_arcsec
+        sums = _by_deflection(chain, problem, evaluation, std * ARCSEC)
+        found.append(("deflection of the vertical", f"{std:g}″", sums))
+    for label, sums in _by_offsets(problem, evaluation):
+        found.append((f"slow errors of {label}", "all that residuals do not show", sums))
+    out = []
+    for cause, assumed, sums in found:
+        by_key = information.covariance_with([sums])
+        changes = {key: -change for key, change in by_key.items()}
+        out.append(ConsideredError(cause, assumed, changes))
+    return tuple(out)
+
+
+def _by_offsets(
+    problem: Problem, evaluation: Evaluation
+) -> Iterator[tuple[str, dict[int, Array]]]:
+    """Yield Bᵀ J of positions by an offset of each component, (h, size) by key, with the label.
+
+    It is what the stated deviation has more than residuals show: an error that persists, which
+    the trajectory follows.
+    """
+    unseen = unseen_offsets(problem)
+    if not unseen:
+        return
+    # Of the deviation that rows are weighed by.
+    columns = {
+        label: np.diag(share / problem.white_factors[label])[:, share > 0.0]
+        for label, share in unseen.items()
+    }
+    found: dict[str, dict[int, Array]] = {label: {} for label in unseen}
+    for rows in problem.observation_rows(evaluation):
+        if rows.source in found:
+            used = np.any(rows.matrix, axis=2)[:, :, None]
+            add_transposed_product(rows, used * columns[rows.source], found[rows.source])
+    yield from found.items()
+
+
+def _by_deflection(
+    chain: InertialChain, problem: Problem, evaluation: Evaluation, std: float
+) -> dict[int, Array]:
+    """Return Bᵀ J of the IMU factors by the components of a deflection, (h, size) by key.
+
+    A deflection tilts gravity: the state that is predicted at the end of a segment moves.
+    """
+    seg, states = chain.segments, evaluation.states
+    middle = 0.5 * (states.p_n[seg.origin] + states.p_n[seg.origin + 1])
+    along = std * STANDARD_GRAVITY * deflection_along(middle[:, :2])
+    duration = seg.duration[:, None, None]
+    pushed = states.nRb[seg.origin + 1, :2].transpose(0, 2, 1) @ along * duration
+    moved = np.concatenate([np.zeros_like(pushed), 0.5 * duration * pushed, pushed], axis=1)
+    native, sizes = problem.native(evaluation), evaluation.values.dims()
+    sums: dict[int, Array] = {}
+    for begin in range(0, chain.count, _CHUNK):
+        some = range(begin, min(begin + _CHUNK, chain.count))
+        factors = [native.at(k) for k in some]
+        rows = np.stack([factor.augmentedJacobian()[:, :-1] for factor in factors])
+        change = rows[:, :, STATE_SIZE : 2 * STATE_SIZE] @ moved[some.start : some.stop]
+        both = -change.transpose(0, 2, 1) @ rows
+        for factor, own in zip(factors, both, strict=True):
+            edge = 0
+            for key in list(factor.keys()):
+                sums[key] = sums.get(key, 0.0) + own[:, edge : edge + sizes[key]]
+                edge += sizes[key]
+    return sums
