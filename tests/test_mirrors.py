@@ -32,7 +32,6 @@ ELSEWHERE = {
     "graph/bound_observation": "graph/test_problem.py",
     "graph/chain": "graph/test_smooth_chain.py",
     "graph/clocks": "solvers/test_clocks.py",
-    "graph/forward_chain": "graph/test_sensor_factor.py",
     "graph/imu_errors": "graph/test_problem.py",
     "graph/observation_rows": "sensors/test_protocol.py",
     "graph/processes": "solvers/test_correlated_noise.py",

@@ -61,6 +61,17 @@ def processes_of(observation: Observation, processes: Sequence[Process]) -> Proc
     return Processes(added[0] if added else None, varying)
 
 
+def covers_windows(
+    chain: Chain, observation: Observation, time: Array, parameters: Mapping[str, Array]
+) -> BoolArray:
+    """Return whether a chain covers the windows about times (M,) over which a sensor averages."""
+    name = observation.averaging
+    if name is None or not parameters[name].any():
+        return np.ones(time.size, dtype=bool)
+    half = 0.5 * abs(float(parameters[name][0]))
+    return np.asarray(chain.covers(time - half) & chain.covers(time + half))
+
+
 @dataclass(eq=False)
 class BoundObservation:
     """An observation tied to a chain.

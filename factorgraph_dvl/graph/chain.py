@@ -188,7 +188,7 @@ class Chain(Protocol):
             Shift of the clock of attitudes beside it.
         window : float, optional, s
             Length of windows about the times, of measurements that are means. A chain without
-            samples, and one that carries the motion forward only, leave it out.
+            samples leaves it out.
         of_attitude : bool, default False
             Whether they are measurements of attitude alone: the track counts for nothing.
         """

@@ -24,7 +24,12 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes, processes_of
+from factorgraph_dvl.graph.bound_observation import (
+    BoundObservation,
+    Processes,
+    covers_windows,
+    processes_of,
+)
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
@@ -758,16 +763,13 @@ class Problem:
         """Tie an observation to the chain."""
         time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
         covered = self.chain.covers(time)
-        name = observation.averaging
-        if name is not None and self.bound_at[name].any():
-            half = 0.5 * abs(float(self.bound_at[name][0]))
-            covered = covered & self.chain.covers(time - half) & self.chain.covers(time + half)
+        covered = covered & covers_windows(self.chain, observation, time, self.bound_at)
         if usable is not None:
             covered = covered & usable
         if not covered.all():
             self.uncovered[observation.label] = int((~covered).sum())
         weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        averages = name in self._key
+        averages = observation.averaging in self._key
         return BoundObservation(
             observation, self.chain, None, covered, weight, self.clock_zero, averages=averages
         )

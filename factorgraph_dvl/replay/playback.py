@@ -22,7 +22,6 @@ from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
 from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Calibration, Progress, Solution
-from factorgraph_dvl.solvers.averaging import windows_left_out
 from factorgraph_dvl.trial import Trial
 
 # What holds only until something else is said.
@@ -272,10 +271,9 @@ def _solution(
                 "IMU",
             )
         )
-    if trial.imu is not None:
-        if trial.dvl is not None and "scale_walk_std_sqrt_h" in trial.dvl.settings.left_out:
-            findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
-        findings += windows_left_out(trial.aids)
+    dvl = None if trial.imu is None else trial.dvl
+    if dvl is not None and "scale_walk_std_sqrt_h" in dvl.settings.left_out:
+        findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
     if run.unused >= LEAST:
         findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.node_jacobian import node_jacobian
+from factorgraph_dvl.graph.node_jacobian import by_node
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements, segments
 from factorgraph_dvl.imu.propagation import States, Transition, attach, motion_at, segment_ends
@@ -124,10 +124,10 @@ def blocks(transition):
     """Attitude, position, velocity and rate at the times by node and bias, (M, 12, 15)."""
     m = transition.at.node.size
     eye, zero = np.broadcast_to(np.eye(3), (m, 3, 3)), np.zeros((m, 3))
-    parts = [
-        node_jacobian(Linearization(zero, **{name: eye}), transition)
-        for name in ("d_theta", "d_p", "d_v", "d_omega")
-    ]
+    parts = []
+    for name in ("d_theta", "d_p", "d_v", "d_omega"):
+        state, bias = by_node(Linearization(zero, **{name: eye}), transition)
+        parts.append(np.concatenate([*state, *bias], axis=2))
     return np.concatenate(parts, axis=1)
 
 
