@@ -334,3 +334,37 @@ class BoundObservation:
         """Return the dimensions of these variables."""
         of_processes = [p.size for p in processes.all for _ in range(2)]
         return [*self.chain.sizes, *of_processes, *(p.mean.size for p in parameters)]
+
+
+def bound_to(
+    chain: Chain,
+    observation: Observation,
+    parameters: Mapping[str, Array],
+    clock_zero: float,
+    usable: BoolArray | None,
+    *,
+    averages: bool,
+) -> BoundObservation:
+    """Return an observation tied to a chain, of which what the chain covers may be used.
+
+    Parameters
+    ----------
+    chain, observation : Chain or Observation
+        Both.
+    parameters : mapping of str to ndarray
+        Values at which it is tied.
+    clock_zero : float, s
+        Reference time of the clock offsets.
+    usable : ndarray of bool, shape (M,), optional
+        Which measurements may be used; by default all.
+    averages : bool
+        Whether the length of the window over which it averages is estimated.
+    """
+    time = time_on_chain(observation, parameters, clock_zero, chain.clock)
+    covered = chain.covers(time) & covers_windows(chain, observation, time, parameters)
+    if usable is not None:
+        covered = covered & usable
+    weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+    return BoundObservation(
+        observation, chain, None, covered, weight, clock_zero, averages=averages
+    )

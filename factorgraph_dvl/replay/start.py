@@ -187,13 +187,9 @@ def solve_start(
     if not minimum.converged:
         return message("not_started.not_converged")
     covariances = posterior(problem, minimum)
-    attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
-    if not attitude < _ATTITUDE:
-        return message("not_started.attitude", std=np.degrees(attitude))
-    if trial.beacons is not None:
-        position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
-        if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
-            return message("not_started.position", std=position)
+    unsure = _not_linear(trial, covariances.nodes[-1])
+    if unsure is not None:
+        return unsure
     evaluation = minimum.evaluation
     # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
@@ -240,6 +236,18 @@ def solve_start(
         findings=settled.findings,
         misfit=_misfit(problem, evaluation),
     )
+
+
+def _not_linear(trial: Trial, P: Array) -> Message | None:
+    """Return why a smoother may not be linearised at a state of covariance P (9, 9), if so."""
+    attitude = float(np.sqrt(np.linalg.eigvalsh(P[:3, :3])[-1]))
+    if not attitude < _ATTITUDE:
+        return message("not_started.attitude", std=np.degrees(attitude))
+    if trial.beacons is not None:
+        position = float(np.sqrt(np.linalg.eigvalsh(P[3:6, 3:6])[-1]))
+        if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
+            return message("not_started.position", std=position)
+    return None
 
 
 def _linear_std(ranges: Array, std: float) -> float:
