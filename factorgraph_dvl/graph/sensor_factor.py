@@ -25,7 +25,7 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.native_graph import custom_factor
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.priors import prior_mean, value_at
-from factorgraph_dvl.imu.preintegration import Preintegration
+from factorgraph_dvl.imu.gtsam_measurements import Preintegration
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.two_way import TwoWay
 from factorgraph_dvl.sensors.parameters import Parameter

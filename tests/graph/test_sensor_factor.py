@@ -24,9 +24,10 @@ from factorgraph_dvl.graph.sensor_factor import (
     sensor_factor,
     states_at,
 )
+from factorgraph_dvl.imu.gtsam_measurements import preintegrate
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.interpolation import Smoothing
-from factorgraph_dvl.imu.preintegration import one_segment, preintegrate
+from factorgraph_dvl.imu.preintegration import one_segment
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.imu import ERRORS
