@@ -20,8 +20,9 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG, HOUR
+from factorgraph_dvl.imu.gtsam_measurements import gtsam_measurements
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import gtsam_measurements, segments
+from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.simulation import parse_scenario, plan_motion, simulate
 from factorgraph_dvl.simulation.scenario import Scenario

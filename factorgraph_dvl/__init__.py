@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from factorgraph_dvl.graph.sensor_check import check_sensor
     from factorgraph_dvl.graph.sensor_factor import measured_nodes, sensor_factor
     from factorgraph_dvl.imu.attitude_history import AttitudeHistory
-    from factorgraph_dvl.imu.preintegration import preintegrate
+    from factorgraph_dvl.imu.gtsam_measurements import preintegrate
     from factorgraph_dvl.planning.prediction import predict
     from factorgraph_dvl.plausibility.survey import survey
     from factorgraph_dvl.quality.verdict import Verdict
@@ -113,7 +113,7 @@ _PUBLIC = {
     "observability": "analysis.information.observability",
     "plot": "report.figures.solution",
     "predict": "planning.prediction",
-    "preintegrate": "imu.preintegration",
+    "preintegrate": "imu.gtsam_measurements",
     "save_solution": "files.solution_folder",
     "save_trial": "files.trial_folder",
     "sensor_factor": "graph.sensor_factor",

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
 
-import msgspec
 import numpy as np
 from msgspec import UnsetType
 
@@ -300,21 +299,6 @@ class Trial:
     def on_one_clock(self) -> Trial:
         """Return the trial with stamps of GNSS less their stated time offset."""
         return self if self.gnss is None else replace(self, gnss=self.gnss.on_trial_clock())
-
-    def without_windows(self) -> Trial:
-        """Return the trial as if its DVL measured each ping in no time."""
-
-        def instantaneous(record: Any) -> Any:
-            if not isinstance(record, Dvl | DvlBeams):
-                return record
-            none = msgspec.structs.replace(record.settings, averaging_s=0.0, averaging_std_s=0.0)
-            return replace(record, settings=none)  # type: ignore[arg-type]
-
-        return replace(
-            self,
-            dvl=None if self.dvl is None else instantaneous(self.dvl),
-            others=tuple(instantaneous(aid) for aid in self.others),
-        )
 
     def until(self, end: float, *, since: float = -np.inf) -> Trial:
         """Return the records between two times, s; a sensor that has none then is left out."""

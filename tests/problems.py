@@ -12,9 +12,10 @@ from factorgraph_dvl.geometry.rotations import (
     exp_so3,
 )
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
-from factorgraph_dvl.graph.problem import Problem, observed
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
+from factorgraph_dvl.sensors.protocol import observed
 from factorgraph_dvl.simulation import simulate
 
 SHORT = [{"straight_s": 3}, {"turn_deg_s": 8, "duration_s": 5, "ramp_s": 1}]

@@ -157,21 +157,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     DataError
         If it has no misalignment, scale error or lever arm.
     """
-    parts: dict[str, tuple[Array, Array]] = {}
-    at = 0
-    for e in calibration.estimates:
-        rows = slice(at, at + e.value.size)
-        parts[e.name] = (e.value, calibration.covariance[rows, rows])
-        at = rows.stop
-    for name in NEEDED:
-        if name not in parts:
-            beams = DIRECTION in parts
-            raise DataError(
-                f"the calibration has no {name}{': it calibrates single beams' if beams else ''}",
-                expected="the calibration of a DVL",
-                hint="Write the matrix of the beams with: factorgraph-dvl correct TRIAL "
-                "CALIBRATION --out DIR" if beams else "",
-            )  # fmt: skip
+    parts = _parts(calibration)
     alpha, covariance = parts[MISALIGNMENT]
     seen = next(e.observable for e in calibration.estimates if e.name == MISALIGNMENT)
     limit = calibration.limits.get(MISALIGNMENT, np.inf)
@@ -233,6 +219,26 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
         alignment_std=alignment.std,
         axes=recorded,
     )
+
+
+def _parts(calibration: Calibration | Solution) -> dict[str, tuple[Array, Array]]:
+    """Return value and covariance of each parameter, those that a DVL needs among them."""
+    parts: dict[str, tuple[Array, Array]] = {}
+    at = 0
+    for e in calibration.estimates:
+        rows = slice(at, at + e.value.size)
+        parts[e.name] = (e.value, calibration.covariance[rows, rows])
+        at = rows.stop
+    for name in NEEDED:
+        if name not in parts:
+            beams = DIRECTION in parts
+            raise DataError(
+                f"the calibration has no {name}{': it calibrates single beams' if beams else ''}",
+                expected="the calibration of a DVL",
+                hint="Write the matrix of the beams with: factorgraph-dvl correct TRIAL "
+                "CALIBRATION --out DIR" if beams else "",
+            )  # fmt: skip
+    return parts
 
 
 def _origin(inputs: Sequence[str]) -> str:

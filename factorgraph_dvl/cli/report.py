@@ -96,6 +96,8 @@ def report(
 
 def _load(folder: Path) -> Result:
     """Return what a solution folder contains."""
+    from factorgraph_dvl.campaign.files import CAMPAIGN_FILE, REPORT_FILE
+    from factorgraph_dvl.errors import ConfigError
     from factorgraph_dvl.files.run_file import read_run
     from factorgraph_dvl.files.solution_folder import (
         CHECK_FILE,
@@ -106,6 +108,13 @@ def _load(folder: Path) -> Result:
     )
     from factorgraph_dvl.report.html.content import Result
 
+    if (folder / CAMPAIGN_FILE).exists():
+        raise ConfigError(
+            "this is the result of a campaign",
+            where=as_text(folder),
+            expected="a solution folder",
+            hint=f"Open {as_text(folder / REPORT_FILE)}: `campaign` wrote its page",
+        )
     run = read_run(folder)
     return Result(
         name=as_text(folder),

@@ -61,6 +61,17 @@ def processes_of(observation: Observation, processes: Sequence[Process]) -> Proc
     return Processes(added[0] if added else None, varying)
 
 
+def covers_windows(
+    chain: Chain, observation: Observation, time: Array, parameters: Mapping[str, Array]
+) -> BoolArray:
+    """Return whether a chain covers the windows about times (M,) over which a sensor averages."""
+    name = observation.averaging
+    if name is None or not parameters[name].any():
+        return np.ones(time.size, dtype=bool)
+    half = 0.5 * abs(float(parameters[name][0]))
+    return np.asarray(chain.covers(time - half) & chain.covers(time + half))
+
+
 @dataclass(eq=False)
 class BoundObservation:
     """An observation tied to a chain.
@@ -323,3 +334,37 @@ class BoundObservation:
         """Return the dimensions of these variables."""
         of_processes = [p.size for p in processes.all for _ in range(2)]
         return [*self.chain.sizes, *of_processes, *(p.mean.size for p in parameters)]
+
+
+def bound_to(
+    chain: Chain,
+    observation: Observation,
+    parameters: Mapping[str, Array],
+    clock_zero: float,
+    usable: BoolArray | None,
+    *,
+    averages: bool,
+) -> BoundObservation:
+    """Return an observation tied to a chain, of which what the chain covers may be used.
+
+    Parameters
+    ----------
+    chain, observation : Chain or Observation
+        Both.
+    parameters : mapping of str to ndarray
+        Values at which it is tied.
+    clock_zero : float, s
+        Reference time of the clock offsets.
+    usable : ndarray of bool, shape (M,), optional
+        Which measurements may be used; by default all.
+    averages : bool
+        Whether the length of the window over which it averages is estimated.
+    """
+    time = time_on_chain(observation, parameters, clock_zero, chain.clock)
+    covered = chain.covers(time) & covers_windows(chain, observation, time, parameters)
+    if usable is not None:
+        covered = covered & usable
+    weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
+    return BoundObservation(
+        observation, chain, None, covered, weight, clock_zero, averages=averages
+    )

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import gtsam
+import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -188,7 +190,7 @@ class Chain(Protocol):
             Shift of the clock of attitudes beside it.
         window : float, optional, s
             Length of windows about the times, of measurements that are means. A chain without
-            samples, and one that carries the motion forward only, leave it out.
+            samples leaves it out.
         of_attitude : bool, default False
             Whether they are measurements of attitude alone: the track counts for nothing.
         """
@@ -235,3 +237,31 @@ class Chain(Protocol):
 
         Of nodes (M, 1), all parts of states are those of the same node.
         """
+
+
+class AtTrueTimes:
+    """What chains have in common whose nodes are at true times, and states one variable each."""
+
+    clock: ClassVar[str | None] = None
+    attitude_clock: ClassVar[str | None] = None
+
+    def shift(self, parameters: Mapping[str, Array]) -> float:
+        """Return 0: attitudes are at the times of the nodes."""
+        return 0.0
+
+    def state_keys(self, k: int) -> list[int]:
+        """Return the key of the state of node k."""
+        return [keys.node(k)]
+
+    def nodes_at(self, at: Any) -> IntArray:
+        """Return the nodes before attached times, (M, 1)."""
+        return np.asarray(at.node)[:, None]
+
+    def states_around(self, values: gtsam.Values, nodes: IntArray) -> Any:
+        """Return the states that measurements after a node (1,) depend on: of it and the next."""
+        (k,) = nodes.tolist()
+        return self._states(values, range(k, k + 2))
+
+    def _states(self, values: gtsam.Values, nodes: range) -> Any:
+        """Return the states of some nodes in a row."""
+        raise NotImplementedError

@@ -19,7 +19,6 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.imu.preintegration import Segments
-from factorgraph_dvl.imu.propagation import Attachment
 from factorgraph_dvl.imu.sensitivity import (
     Sensitivity,
     at_errors,
@@ -100,13 +99,9 @@ class ImuErrors:
         """Find how what is integrated up to attached times moves, of all of them at once."""
         new = [at for at in {id(at): at for at in attachments}.values() if at not in self._by]
         if new or self._of_ends is None:
-            forward = [self.forward(at) for at in new]
+            forward = [at.forward for at in new]
             self._of_ends, found = sensitivities(self._segments, self._elements, forward)
             self._by.update(zip(new, found, strict=True))
-
-    def forward(self, at: Any) -> Attachment:
-        """Return where times are attached to the nodes before."""
-        return at.forward
 
     @cached_property
     def _ends(self) -> Array:
@@ -130,18 +125,14 @@ class ImuErrors:
         self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array
     ) -> dict[str, Array]:
         """Return derivatives of measurements by the errors (n,) there, (M, d, n_i) by name."""
-        every = self._every(lin, transition, by, errors)
-        parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
-        return dict(zip(self.names, parts, strict=True))
-
-    def _every(self, lin: Linearization, transition: Any, by: Sensitivity, errors: Array) -> Array:
-        """Return derivatives of measurements by all errors (n,), (M, d, n)."""
         assert self._of_ends is not None
         by, ends = (at_errors(each, errors) for each in (by, self._of_ends))
         back = carried_back_by(transition.at, by, ends)
         ahead, behind = shares(lin, transition)
         every = by_errors(ahead, transition.forward, by, self._elements)
-        return every + by_errors(behind, transition.backward, back, self._elements)
+        every = every + by_errors(behind, transition.backward, back, self._elements)
+        parts = np.split(every, np.cumsum(self._sizes)[:-1], axis=2)
+        return dict(zip(self.names, parts, strict=True))
 
     def linearized(self, native: gtsam.GaussianFactorGraph, errors: Array) -> LinearImuFactors:
         """Return native factors with what errors (n,) change in those of the IMU.

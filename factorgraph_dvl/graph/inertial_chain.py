@@ -24,7 +24,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import StepRows
+from factorgraph_dvl.graph.chain import AtTrueTimes, StepRows
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.node_jacobian import two_way_jacobian
@@ -37,7 +37,8 @@ from factorgraph_dvl.graph.priors import (
     square_root,
 )
 from factorgraph_dvl.graph.trajectory import EPOCH_ROUNDING, trajectory_between
-from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements
+from factorgraph_dvl.imu.gtsam_measurements import gtsam_measurements
+from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.two_way import (
     TwoWay,
@@ -81,7 +82,7 @@ LEAST_WALK = np.repeat([1e-9, 1e-11], 3)
 
 
 @dataclass(frozen=True)
-class InertialChain:
+class InertialChain(AtTrueTimes):
     """The inertial part of a graph, common to every set of aiding sensors.
 
     Parameters
@@ -109,9 +110,6 @@ class InertialChain:
     first_biases: tuple[Parameter, Parameter]
     imu: ImuSettings
     graph: gtsam.NonlinearFactorGraph
-    # Nodes are at true times, which are those of the IMU.
-    clock: ClassVar[str | None] = None
-    attitude_clock: ClassVar[str | None] = None
     interpolates: ClassVar[bool] = False
     step_source: ClassVar[str | None] = None
 
@@ -200,11 +198,6 @@ class InertialChain:
         """Return states and biases as arrays."""
         return self._states(values, range(self.node_time.size))
 
-    def states_around(self, values: gtsam.Values, nodes: IntArray) -> States:
-        """Return the states that measurements after a node (1,) depend on: of it and the next."""
-        (k,) = nodes.tolist()
-        return self._states(values, range(k, k + 2))
-
     def from_node(self, nodes: IntArray) -> Self:
         """Return what carries the motion from a node (1,) to the next: they are the first two."""
         (k,) = nodes.tolist()
@@ -236,10 +229,6 @@ class InertialChain:
     def covers(self, time: Array) -> BoolArray:
         """Whether the IMU recorded the motion at times (M,)."""
         return np.asarray(self.segments.increments.locate(time)[2])
-
-    def shift(self, parameters: Mapping[str, Array]) -> float:
-        """Return 0: attitudes are at the times of the nodes."""
-        return 0.0
 
     def attach(
         self,
@@ -276,14 +265,6 @@ class InertialChain:
     def node_jacobian(self, lin: Linearization, transition: TwoWayTransition) -> Array:
         """Return the derivative of residuals by the variables of measurements, (M, d, n)."""
         return two_way_jacobian(lin, transition, walking=self.walking)
-
-    def state_keys(self, k: int) -> list[int]:
-        """Return the key of the state of node k."""
-        return [keys.node(k)]
-
-    def nodes_at(self, at: TwoWay) -> IntArray:
-        """Return the nodes before attached times, (M, 1)."""
-        return at.node[:, None]
 
     def variables(self, nodes: IntArray) -> list[IntArray]:
         """Return the keys of the variables of measurements after nodes (M, 1), (M,) each."""

@@ -13,36 +13,19 @@ from factorgraph_dvl.sensors.protocol import Linearization
 def two_way_jacobian(lin: Linearization, transition: TwoWayTransition, *, walking: bool) -> Array:
     """Return the derivative of residuals by the nodes before and after, (M, d, 24 or 30).
 
-    Columns: state and bias as of `node_jacobian`, then the state at the node after and, of biases
-    that walk, that one's too.
+    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then accelerometer
+    and gyro bias, then the state at the node after and, of biases that walk, that one's too.
     """
     ahead, behind = shares(lin, transition)
-    state, bias = _by_node(ahead, transition.forward)
-    state_after, bias_after = _by_node(behind, transition.backward)
+    state, bias = by_node(ahead, transition.forward)
+    state_after, bias_after = by_node(behind, transition.backward)
     if walking:
         return np.concatenate([*state, *bias, *state_after, *bias_after], axis=2)
     both = (one + other for one, other in zip(bias, bias_after, strict=True))
     return np.concatenate([*state, *both, *state_after], axis=2)
 
 
-def node_jacobian(lin: Linearization, transition: Transition) -> Array:
-    """Return the derivative of residuals with respect to a node and its bias, (M, d, 15).
-
-    Columns: attitude, position, velocity in GTSAM's tangent space of NavState, then
-    accelerometer and gyro bias.
-
-    Parameters
-    ----------
-    lin : Linearization
-        Derivatives with respect to the motion at the M times.
-    transition : Transition
-        Transition from the nodes to these times.
-    """
-    state, bias = _by_node(lin, transition)
-    return np.concatenate([*state, *bias], axis=2)
-
-
-def _by_node(lin: Linearization, transition: Transition) -> tuple[tuple[Array, ...], ...]:
+def by_node(lin: Linearization, transition: Transition) -> tuple[tuple[Array, ...], ...]:
     """Return the derivatives by attitude, position, velocity, and by both biases, (M, d, 3) each.
 
     Each row of those by the motion times the blocks of `Transition`, without the blocks: far fewer

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import StepRows
+from factorgraph_dvl.graph.chain import AtTrueTimes, StepRows
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.smooth_motion import variance_between
 from factorgraph_dvl.graph.trajectory import epochs_between, reported
@@ -129,7 +129,7 @@ class Between:
 
 
 @dataclass(frozen=True)
-class PlanarChain:
+class PlanarChain(AtTrueTimes):
     """Nodes of a planar trial, tied by white acceleration in the plane.
 
     Parameters
@@ -165,8 +165,6 @@ class PlanarChain:
     block: slice | None = None
     interpolates: ClassVar[bool] = True
     step_source: ClassVar[str | None] = MOTION
-    clock: ClassVar[str | None] = None
-    attitude_clock: ClassVar[str | None] = None
 
     @property
     def count(self) -> int:
@@ -230,14 +228,6 @@ class PlanarChain:
         """Return the keys of the states of nodes."""
         return [keys.node(k) for k in nodes]
 
-    def state_keys(self, k: int) -> list[int]:
-        """Return the key of the state of node k."""
-        return [keys.node(k)]
-
-    def nodes_at(self, at: Attached) -> IntArray:
-        """Return the nodes before attached times, (M, 1)."""
-        return at.node[:, None]
-
     def variables(self, nodes: IntArray) -> list[IntArray]:
         """Return the keys of the variables of measurements after nodes (M, 1), (M,) each."""
         node = nodes[:, 0]
@@ -253,11 +243,6 @@ class PlanarChain:
     def states(self, values: gtsam.Values) -> PlanarStates:
         """Return states as arrays."""
         return self._states(values, range(self.node_time.size))
-
-    def states_around(self, values: gtsam.Values, nodes: IntArray) -> PlanarStates:
-        """Return the states that measurements after a node (1,) depend on."""
-        (k,) = nodes.tolist()
-        return self._states(values, range(k, k + 2))
 
     def _states(self, values: gtsam.Values, nodes: range) -> PlanarStates:
         x = np.array([values.atVector(keys.node(k)) for k in nodes])
@@ -282,10 +267,6 @@ class PlanarChain:
         """Whether times (M,) are between the first node and the last."""
         first, last = self.node_time[[0, -1]]
         return np.asarray((time >= first - _ROUNDING) & (time <= last + _ROUNDING))
-
-    def shift(self, parameters: Mapping[str, Array]) -> float:
-        """Return 0: all nodes are at true times."""
-        return 0.0
 
     def attach(
         self,

@@ -11,24 +11,24 @@ values.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from copy import copy
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property
-from itertools import zip_longest
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes, processes_of
+from factorgraph_dvl.graph.bound_observation import (
+    BoundObservation,
+    Processes,
+    bound_to,
+    processes_of,
+)
 from factorgraph_dvl.graph.chain import Chain
-from factorgraph_dvl.graph.clocks import time_on_chain
-from factorgraph_dvl.graph.factor_layout import CHUNK, Part, factor_layout
-from factorgraph_dvl.graph.imu_errors import ImuErrors, LinearImuFactors
+from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.measurement_factors import Evaluation, MeasurementFactors, Rows
 from factorgraph_dvl.graph.native_graph import native_graph
 from factorgraph_dvl.graph.priors import (
     ConstantsPrior,
@@ -44,14 +44,13 @@ from factorgraph_dvl.graph.priors import (
 from factorgraph_dvl.graph.processes import Process, in_time_order
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.sensors.gross_errors import gross_errors
-from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
-    Aid,
-    Linearization,
     Motion,
     Observation,
 )
+
+__all__ = ["Evaluation", "Problem", "Rows"]
 
 # Stands for zero in a fixed direction, in standard deviations of the prior. Chosen: what data
 # that do not determine the direction cannot move.
@@ -59,93 +58,6 @@ FIXED_DIRECTION_STD = 1e-4
 # Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
 # less hardly moves the minimum.
 _SAME_WEIGHT = 0.2
-
-
-@dataclass
-class _Block:
-    """Observations with the same variables: one factor per set of nodes for all of them.
-
-    `parts` has, by observation, which of its rows go to which of the factors, and where.
-    `matrices` and `vectors` are views into `factors` and live no longer than they do.
-    """
-
-    bound: list[BoundObservation]
-    parameters: tuple[Parameter, ...]
-    parts: list[list[Part]] = field(default_factory=list)
-    factors: list[gtsam.JacobianFactor] = field(default_factory=list)
-    matrices: list[Array] = field(default_factory=list)
-    vectors: list[Array] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Motion, residuals and cost at one set of values.
-
-    Parameters
-    ----------
-    values : gtsam.Values
-        Values of all variables, as GTSAM has them.
-    states, parameters : object or dict of str to ndarray
-        The same as arrays: states as the chain has them, parameters by name, rotations as
-        matrices.
-    attached, motions, residuals : list of Attached, of Motion or of ndarray
-        Per observation: where it is attached to the chain; residuals whitened, (M, d).
-    cost : float
-        Half the sum of all squared whitened residuals.
-    own_cost : float
-        The part of it that is not of measurements.
-    imu : LinearImuFactors, optional
-        Native factors, linear there, where errors of the IMU are estimated.
-    """
-
-    values: gtsam.Values
-    states: Any
-    parameters: dict[str, Array]
-    attached: list[Any]
-    motions: list[Motion]
-    residuals: list[Array]
-    cost: float
-    own_cost: float
-    imu: LinearImuFactors | None = None
-
-
-@dataclass(frozen=True)
-class Rows:
-    """Whitened rows of the linearised graph, in M items of d rows; each row has unit noise.
-
-    Parameters
-    ----------
-    source : str
-        Where the noise comes from.
-    components : tuple of str
-        Names of the d rows of an item.
-    keys : ndarray, shape (M, k)
-        Variables of each item.
-    sizes : tuple of int
-        Dimensions of the k variables.
-    matrix : ndarray, shape (M, d, n)
-        Jacobian with respect to these variables side by side.
-    vector : ndarray, shape (M, d)
-        Residual.
-    begin : int, default 0
-        Number of the first item among all of an observation.
-    """
-
-    source: str
-    components: tuple[str, ...]
-    keys: IntArray
-    sizes: tuple[int, ...]
-    matrix: Array
-    vector: Array
-    begin: int = 0
-
-
-def observed(
-    aids: Sequence[Aid], frame: LocalFrame, body_axes: BodyAxes
-) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
-    """Return the measurements and the calibration parameters of aiding sensors."""
-    observations = tuple(o for aid in aids for o in aid.observations(frame, body_axes))
-    return observations, tuple(p for aid in aids for p in aid.parameters())
 
 
 class Problem:
@@ -240,15 +152,19 @@ class Problem:
         self._bound: list[BoundObservation] = []
         for observation in observations:
             may_be_used = (usable or {}).get(observation.label)
-            self._bound.append(self._bind(observation, may_be_used))
+            averages = observation.averaging in self._key
+            bound = bound_to(
+                chain, observation, self.bound_at, self.clock_zero, may_be_used, averages=averages
+            )
+            self._bound.append(bound)
+            if not bound.usable.all():
+                self.uncovered[observation.label] = int((~bound.usable).sum())
         self._imu_errors = chain.errors(self.parameters, self._key)
-        blocks: dict[tuple[tuple[str, ...], ...], _Block] = {}
         for bound in self._bound:
             bound.errors = self._imu_errors
-            used = bound.parameters(self.parameters)
-            kind = tuple(p.name for p in used), self.processes_of(bound).names
-            blocks.setdefault(kind, _Block([], used)).bound.append(bound)
-        self._blocks = list(blocks.values())
+        self._factors = MeasurementFactors.of(
+            chain, self._bound, self.parameters, self._key, self.processes
+        )
 
     @property
     def observations(self) -> tuple[Observation, ...]:
@@ -301,7 +217,7 @@ class Problem:
         """Return states, and parameters by name, of GTSAM's values; rotations as matrices."""
         parameters = {**self._fixed}
         for p in self.parameters:
-            parameters[p.name] = self._parameter(values, p)
+            parameters[p.name] = value_at(values, self._key[p.name], p)
         for process in self.processes:
             nodes = [values.atVector(process.key(j)) for j in range(process.time.size)]
             parameters[process.name] = np.array(nodes)
@@ -558,57 +474,18 @@ class Problem:
 
         Its measurement factors are written in place at the next call.
         """
-        self._follow(evaluation)
         gaussian = self.native(evaluation)
         if self.tilt is not None:
             tilt = self.tilt.factor(self.parameters, self._key)
             gaussian.push_back(tilt.linearize(evaluation.values))
         self._add_steps(gaussian, evaluation)
-        for block in self._blocks:
-            if not block.factors:
-                self._lay_out(block)
-        self._fill(evaluation)
-        for block in self._blocks:
-            for factor in block.factors:
-                gaussian.push_back(factor)
+        for factor in self._factors.written(evaluation, self.processes):
+            gaussian.push_back(factor)
         return gaussian
-
-    def _follow(self, evaluation: Evaluation) -> None:
-        """Attach measurements where their clocks are at an evaluation."""
-        for block in self._blocks:
-            for bound in block.bound:
-                at = evaluation.attached[self._bound.index(bound)]
-                before, bound.attachment = bound.attachment, at
-                if before is None or not (
-                    at is before
-                    or np.array_equal(self.chain.nodes_at(at), self.chain.nodes_at(before))
-                ):
-                    block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
-
-    def _fill(self, evaluation: Evaluation) -> None:
-        """Write the rows of measurements into their factors, some at a time."""
-        observed = [(block, bound) for block in self._blocks for bound in block.bound]
-        linear = [
-            self._linearized(bound, block.parameters, evaluation) for block, bound in observed
-        ]
-        of_all = (parts for block in self._blocks for parts in block.parts)
-        for some in zip_longest(*of_all):
-            transitions: dict[Hashable, Any] = {}
-            for (block, bound), lin, part in zip(observed, linear, some, strict=True):
-                if part is None:
-                    continue
-                matrix, vector = self._jacobian(
-                    bound, block.parameters, lin, part.measurements, evaluation, transitions
-                )
-                matrix, vector = matrix.reshape(-1, matrix.shape[2]), -vector.ravel()
-                for factor_index, there, here in part.places:
-                    block.matrices[factor_index][there] = matrix[here]
-                    block.vectors[factor_index][there] = vector[here]
 
     def release(self) -> None:
         """Free the factors of measurements; the next linearisation makes others."""
-        for block in self._blocks:
-            block.parts, block.matrices, block.vectors, block.factors = [], [], [], []
+        self._factors.release()
         self._steps = []
         if self._imu_errors is not None:
             self._imu_errors.release()
@@ -618,20 +495,7 @@ class Problem:
 
         Unused ones are included: these are zero.
         """
-        self._follow(evaluation)
-        for block in self._blocks:
-            for bound in block.bound:
-                lin = self._linearized(bound, block.parameters, evaluation)
-                o, sizes = bound.observation, tuple(self._sizes(block))
-                variables = self._keys_at(block, bound.nodes(self.processes_of(bound)))
-                for begin in range(0, max(len(lin.residual), 1), CHUNK):
-                    some = slice(begin, begin + CHUNK)
-                    matrix, vector = self._jacobian(
-                        bound, block.parameters, lin, some, evaluation, {}
-                    )
-                    yield Rows(
-                        o.label, o.components, variables[some], sizes, matrix, vector, begin
-                    )
+        yield from self._factors.rows(evaluation, self.processes)
 
     def observation_rows_at(
         self, evaluation: Evaluation, parameters: Mapping[str, Array]
@@ -647,23 +511,7 @@ class Problem:
         parameters : mapping of str to ndarray
             Values of some parameters by name, rotations as matrices; not of clocks.
         """
-        other, values = copy(self), {**evaluation.parameters, **parameters}
-        seen = [i for i, bound in enumerate(self._bound) if parameters.keys() & bound.names]
-        attached, motions = (
-            [each[i] for i in seen] for each in (evaluation.attached, evaluation.motions)
-        )
-        other._bound = [self._bound[i] for i in seen]
-        if parameters.keys() & ERRORS.keys():
-            motions = [
-                bound.motion(at, evaluation.states, values)
-                for bound, at in zip(other._bound, attached, strict=True)
-            ]
-        other._blocks = [
-            replace(block, bound=[each for each in block.bound if each in other._bound])
-            for block in self._blocks
-        ]
-        there = replace(evaluation, parameters=values, attached=attached, motions=motions)
-        yield from other.observation_rows(there)
+        yield from self._factors.rows_at(evaluation, parameters, self.processes)
 
     def nonlinear_graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         """Return the whole problem for GTSAM's own optimisers, and values to start from.
@@ -688,7 +536,7 @@ class Problem:
         """
         if self._weighed_at is None:
             raise ValueError("the measurements have no weights yet: call `weigh` first")
-        self._follow(self.evaluate(self._weighed_at))
+        self._factors.follow(self.evaluate(self._weighed_at))
         return native_graph(self), gtsam.Values(self._weighed_at)
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
@@ -750,80 +598,3 @@ class Problem:
     def key(self, name: str) -> int:
         """Return the key of an estimated parameter."""
         return self._key[name]
-
-    def _parameter(self, values: gtsam.Values, p: Parameter) -> Array:
-        return value_at(values, self._key[p.name], p)
-
-    def _bind(self, observation: Observation, usable: BoolArray | None) -> BoundObservation:
-        """Tie an observation to the chain."""
-        time = time_on_chain(observation, self.bound_at, self.clock_zero, self.chain.clock)
-        covered = self.chain.covers(time)
-        name = observation.averaging
-        if name is not None and self.bound_at[name].any():
-            half = 0.5 * abs(float(self.bound_at[name][0]))
-            covered = covered & self.chain.covers(time - half) & self.chain.covers(time + half)
-        if usable is not None:
-            covered = covered & usable
-        if not covered.all():
-            self.uncovered[observation.label] = int((~covered).sum())
-        weight = np.repeat(covered.astype(float)[:, None], len(observation.components), axis=1)
-        averages = name in self._key
-        return BoundObservation(
-            observation, self.chain, None, covered, weight, self.clock_zero, averages=averages
-        )
-
-    def _lay_out(self, block: _Block) -> None:
-        """Make a block's factors for the nodes that its measurements depend on."""
-        found = factor_layout(
-            [b.nodes(self.processes_of(b)) for b in block.bound],
-            [len(b.observation.components) for b in block.bound],
-        )
-        block.parts = found.parts
-        sizes = self._sizes(block)
-        block.matrices, block.vectors, block.factors = [], [], []
-        variables = self._keys_at(block, found.nodes).tolist()
-        for own, rows in zip(variables, found.rows, strict=True):
-            factor = jacobian_template(own, sizes, rows)
-            block.factors.append(factor)
-            block.matrices.append(factor.getA())
-            block.vectors.append(factor.getb())
-
-    def _keys_at(self, block: _Block, nodes: IntArray) -> IntArray:
-        """Return the variables of a block's measurements at nodes as they have them."""
-        first = block.bound[0]
-        shared = [self._key[p.name] for p in block.parameters]
-        return first.keys_at(nodes, self.processes_of(first), shared)
-
-    def _sizes(self, block: _Block) -> list[int]:
-        """Return the dimensions of these variables."""
-        first = block.bound[0]
-        return first.sizes(self.processes_of(first), block.parameters)
-
-    def _linearized(
-        self, bound: BoundObservation, parameters: Sequence[Parameter], evaluation: Evaluation
-    ) -> Linearization:
-        """Return an observation linearised at an evaluation."""
-        motion = evaluation.motions[self._bound.index(bound)]
-        wanted = [p.name for p in parameters]
-        return bound.linearized(motion, evaluation.parameters, wanted, self.processes_of(bound))
-
-    def _jacobian(
-        self,
-        bound: BoundObservation,
-        parameters: Sequence[Parameter],
-        lin: Linearization,
-        some: slice | IntArray,
-        evaluation: Evaluation,
-        transitions: dict[Hashable, Any],
-    ) -> tuple[Array, Array]:
-        """Return the whitened Jacobian (M, d, n) and residual (M, d) of some measurements."""
-        return bound.jacobian(
-            lin,
-            some,
-            evaluation.motions[self._bound.index(bound)],
-            evaluation.states,
-            evaluation.parameters,
-            [p.name for p in parameters],
-            self.processes_of(bound),
-            transitions,
-        )

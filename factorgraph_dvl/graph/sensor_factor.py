@@ -13,21 +13,22 @@ from functools import lru_cache
 from typing import Any
 
 import gtsam
+import msgspec
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes
+from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes, covers_windows
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
-from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
+from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.native_graph import custom_factor
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.priors import prior_mean, value_at
-from factorgraph_dvl.imu.preintegration import Preintegration
-from factorgraph_dvl.imu.propagation import Attachment, States
+from factorgraph_dvl.imu.gtsam_measurements import Preintegration
+from factorgraph_dvl.imu.propagation import States
+from factorgraph_dvl.imu.two_way import TwoWay
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion, Observation
 
@@ -55,7 +56,7 @@ class NodeMeasurements:
     parameters: tuple[Parameter, ...]
     fixed: Mapping[str, Array]
     # What hangs at the times of the last evaluation.
-    _attached: dict[tuple[bytes, ...], list[Attachment]] = field(default_factory=dict)
+    _attached: dict[tuple[Hashable, ...], list[TwoWay]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -68,20 +69,21 @@ class NodeMeasurements:
         used = {name for b in bound for name in b.names}
         return cls(tuple(bound), tuple(p for p in estimated if p.name in used), fixed)
 
-    def attach(self, values: Mapping[str, Array]) -> list[Attachment]:
+    def attach(self, values: Mapping[str, Array]) -> list[TwoWay]:
         """Attach measurements by clocks as they are; those of one time share what they depend on.
 
-        Few times take as long as a single one: all at once.
+        Few times take as long as a single one: all of the same window at once.
         """
-        times = [b.times(values) for b in self.bound]
-        when = tuple(time.tobytes() for time in times)
+        places = [(b.times(values), b.window(values)) for b in self.bound]
+        when = tuple((time.tobytes(), window) for time, window in places)
         if when not in self._attached:
-            chain, count = self.bound[0].chain, 0
-            whole = chain.attach(np.concatenate(times))
-            found: dict[bytes, Attachment] = {}
-            for time in times:
-                found.setdefault(time.tobytes(), rows_of(whole, slice(count, count + time.size)))
-                count += time.size
+            chain, found = self.bound[0].chain, dict[Hashable, TwoWay]()
+            for window in {window for _, window in places}:
+                own = {time.tobytes(): time for time, each in places if each == window}
+                whole, count = chain.attach(np.concatenate([*own.values()]), window=window), 0
+                for key, time in own.items():
+                    found[key, window] = rows_of(whole, slice(count, count + time.size))
+                    count += time.size
             self._attached.clear()
             self._attached[when] = [found[each] for each in when]
         out = self._attached[when]
@@ -94,7 +96,7 @@ class NodeMeasurements:
     def motions(self, states: States, values: Mapping[str, Array]) -> list[Motion]:
         """Return the motion at the true times of each kind; those of one time share it."""
         values = {**self.fixed, **values}
-        computed: dict[Attachment, Motion] = {}
+        computed: dict[TwoWay, Motion] = {}
         out = []
         for b, at in zip(self.bound, self.attach(values), strict=True):
             if at not in computed:
@@ -104,16 +106,17 @@ class NodeMeasurements:
 
     def linearize(
         self, states: States, values: Mapping[str, Array]
-    ) -> tuple[Array, Array, list[Motion]]:
-        """Return residuals (R,), their Jacobian (R, 15 + n), and the motions.
+    ) -> tuple[Array, Array, list[Motion], Array]:
+        """Return residuals (R,), their Jacobian (R, c + n), the motions, and missing variance.
 
-        Columns: variables of the chain, as it has them, then the parameters.
+        Columns: variables of the chain, as it has them, then the parameters. The variance (R,) is
+        what is missing between the nodes.
         """
         values = {**self.fixed, **values}
         motions = self.motions(states, values)
         transitions: dict[Hashable, Any] = {}
         every = tuple((p.name, p.mean.size) for p in self.parameters)
-        residuals, matrices = [], []
+        residuals, matrices, variances = [], [], []
         for b, motion in zip(self.bound, motions, strict=True):
             wanted = [p.name for p in b.parameters(self.parameters)]
             lin = b.linearized(motion, values, wanted, _NO_PROCESSES)
@@ -125,24 +128,38 @@ class NodeMeasurements:
             matrix[:, columns] = own.reshape(residual.size, -1)
             residuals.append(residual.ravel())
             matrices.append(matrix)
-        return np.concatenate(residuals), np.concatenate(matrices), motions
+            missing = b.chain.missing(b.attachment, lin)
+            variances.append(np.zeros(residual.size) if missing is None else missing.ravel())
+        return (
+            np.concatenate(residuals),
+            np.concatenate(matrices),
+            motions,
+            np.concatenate(variances),
+        )
 
     def sigma(
         self,
         motions: Sequence[Motion],
+        missing: Array,
         values: Mapping[str, Array],
         factors: Mapping[str, Array],
     ) -> Array:
-        """Return the standard deviations, (R,), at motions of each kind.
+        """Return the standard deviations, (R,), at motions of each kind; infinite beyond the IMU.
 
-        `factors` (d,) multiply those that sensors state for their own noise, by label.
+        `missing` (R,) is added to the variance; `factors` (d,) multiply what sensors state for
+        their own noise, by label.
         """
         values = {**self.fixed, **values}
         each = (
             b.observation.sigma(motion, values, factors.get(b.observation.label, 1.0))
             for b, motion in zip(self.bound, motions, strict=True)
         )
-        return np.concatenate([sigma.ravel() for sigma in each])
+        out = np.sqrt(np.concatenate([sigma.ravel() for sigma in each]) ** 2 + missing)
+        covered = []
+        for b in self.bound:
+            inside = covers_windows(b.chain, b.observation, b.times(values), values)
+            covered.append(inside.repeat(b.weight.shape[1]))
+        return np.where(np.concatenate(covered), out, np.inf)
 
 
 @lru_cache
@@ -194,53 +211,51 @@ def bind(
     for o in observations:
         count = o.time.size
         usable, weight = np.ones(count, dtype=bool), np.ones((count, len(o.components)))
-        bound.append(BoundObservation(o, chain, None, usable, weight, clock_zero, errors))
+        averages = o.averaging in key_of
+        bound.append(
+            BoundObservation(o, chain, None, usable, weight, clock_zero, errors, averages)
+        )
     return bound, errors
 
 
 @dataclass(frozen=True)
 class Linearized:
-    """Residual (R,) and Jacobian (R, 15 + n) of measurements, and where they were computed.
+    """Residual (R,) and Jacobian (R, c + n) of measurements, and where they were computed.
 
     Parameters
     ----------
-    state, bias : gtsam.NavState or gtsam.imuBias.ConstantBias
-        State and bias of the node.
+    states : States
+        States of both nodes.
     values : mapping of str to ndarray
         Values of the parameters.
     residual, jacobian : ndarray
         Residual and Jacobian that `NodeMeasurements.linearize` returns.
     """
 
-    state: gtsam.NavState
-    bias: gtsam.imuBias.ConstantBias
+    states: States
     values: Mapping[str, Array]
     residual: Array
     jacobian: Array
 
-    def is_at(
-        self,
-        state: gtsam.NavState,
-        bias: gtsam.imuBias.ConstantBias,
-        values: Mapping[str, Array],
-    ) -> bool:
-        """Whether it was computed at this very state and these values."""
-        if not (self.state.equals(state, 0.0) and self.bias.equals(bias, 0.0)):
-            return False
+    def is_at(self, states: States, values: Mapping[str, Array]) -> bool:
+        """Whether it was computed at these very states and values."""
+        own = (*vars(self.states).values(), *(self.values[name] for name in values))
         # Bytes of few numbers take less time to compare.
-        return all(self.values[name].tobytes() == at.tobytes() for name, at in values.items())
+        return all(
+            a.tobytes() == b.tobytes()
+            for a, b in zip(own, (*vars(states).values(), *values.values()), strict=True)
+        )
 
 
 def measurement_factor(
     measured: NodeMeasurements,
     weight: Array,
-    node_key: int,
-    bias_key: int,
+    nodes: Sequence[int],
     parameter_keys: Sequence[int],
     first: Linearized | None = None,
     errors: Mapping[int, Array] | None = None,
 ) -> gtsam.CustomFactor:
-    """Return the factor of what was measured after a node; zero error where it is predicted.
+    """Return the factor of what was measured between two nodes; zero error where it is predicted.
 
     Parameters
     ----------
@@ -248,8 +263,8 @@ def measurement_factor(
         Rows R in all.
     weight : ndarray, shape (R,)
         Inverse standard deviations; 0 = not used.
-    node_key, bias_key, parameter_keys : int or sequence of int
-        Keys of the variables, parameters as in `measured`.
+    nodes, parameter_keys : sequence of int
+        Keys of the variables of the chain, as it has them, and of parameters as in `measured`.
     first : Linearized, optional
         Where GTSAM will linearise first.
     errors : mapping of int to ndarray, optional
@@ -257,23 +272,23 @@ def measurement_factor(
     """
     kept = [first] if first is not None else []
     added = [] if errors is None else [*errors.items()]
-    every = [node_key, bias_key, *parameter_keys, *(key for key, _ in added)]
-    sizes = [STATE_SIZE, BIAS_SIZE, *(p.mean.size for p in measured.parameters)]
+    every = [*nodes, *parameter_keys, *(key for key, _ in added)]
+    sizes = [*measured.bound[0].chain.sizes, *(p.mean.size for p in measured.parameters)]
     sizes += [gain.shape[1] for _, gain in added]
     if len(every) != len(sizes):
         raise ValueError(f"{len(parameter_keys)} keys for {len(measured.parameters)} parameters")
 
     def linearize(at: gtsam.Values) -> tuple[Array, Array]:
-        state, bias = at.atNavState(node_key), at.atConstantBias(bias_key)
+        states = states_at(at, nodes)
         values = {
             p.name: value_at(at, key, p)
             for p, key in zip(measured.parameters, parameter_keys, strict=True)
         }
         once = kept.pop() if kept else None
-        if once is not None and once.is_at(state, bias, values):
+        if once is not None and once.is_at(states, values):
             residual, matrix = once.residual, once.jacobian
         else:
-            residual, matrix, _ = measured.linearize(state_of(state, bias), values)
+            residual, matrix, *_ = measured.linearize(states, values)
         for key, gain in added:
             residual, matrix = residual + gain @ at.atVector(key), np.hstack([matrix, gain])
         return weight * residual, weight[:, None] * matrix
@@ -281,15 +296,26 @@ def measurement_factor(
     return custom_factor(every, sizes, weight.size, linearize)
 
 
-def state_of(state: gtsam.NavState, bias: gtsam.imuBias.ConstantBias) -> States:
-    """Return GTSAM's state and bias as the states of a single node."""
-    matrix, vector = state.matrix()[None], bias.vector()
+def states_at(values: gtsam.Values, nodes: Sequence[int]) -> States:
+    """Return the states of two nodes: keys of state and bias of each, or of a bias of both."""
+    biases = [values.atConstantBias(key) for key in nodes[1::2]]
+    return states_of([values.atNavState(key) for key in nodes[::2]], biases)
+
+
+def states_of(
+    states: Sequence[gtsam.NavState], biases: Sequence[gtsam.imuBias.ConstantBias]
+) -> States:
+    """Return GTSAM's states of some nodes, with the bias of each or the one of all, as arrays."""
+    matrix = np.array([state.matrix() for state in states])
+    bias = np.array([each.vector() for each in biases])
+    if len(bias) < len(matrix):
+        bias = bias.repeat(len(matrix), axis=0)
     return States(
         matrix[:, :3, :3],
         matrix[:, :3, 3],
         matrix[:, :3, 4],
-        gyro_bias=vector[None, 3:],
-        accel_bias=vector[None, :3],
+        gyro_bias=bias[:, 3:],
+        accel_bias=bias[:, :3],
     )
 
 
@@ -305,10 +331,11 @@ def sensor_factor(
 ) -> gtsam.CustomFactor:
     """Return a factor of what a sensor measured between node k and the next.
 
-    Its variables are the `NavState` at node k, the `ConstantBias` of the IMU, and those
+    Its variables are the `NavState` at both nodes, the `ConstantBias` of the IMU, and those
     calibration parameters that have a key: a `Rot3` for a rotation, else a vector, SI. It works
     in any graph, and GTSAM's own optimisers and `Marginals` take it. The other parameters are
-    fixed at their prior means. Each measurement counts as instantaneous.
+    fixed at their prior means. `Problem` has the same factors, but for windows: here each
+    measurement counts as instantaneous.
 
     Parameters
     ----------
@@ -321,7 +348,9 @@ def sensor_factor(
     k : int
         Node.
     keys : mapping of str to int
-        Keys of the state, `state`, of the bias, `bias`, and of parameters by name.
+        Keys of both states, `state` and `state_after`, of the bias, `bias`, of that at the node
+        after, `bias_after`, where the IMU's biases walk and have one there, and of parameters by
+        name.
     values : gtsam.Values
         Approximate values of these variables. Standard deviations are taken there.
     clock_zero : float, optional
@@ -357,14 +386,16 @@ def sensor_factor(
     >>> (velocity,) = dvl.observations(frame, "RFU")
     >>> values = gtsam.Values()
     >>> values.insert(X(0), gtsam.NavState())
+    >>> values.insert(X(1), gtsam.NavState(gtsam.Rot3.Rz(0.1), np.zeros(3), np.zeros(3)))
     >>> values.insert(B(0), gtsam.imuBias.ConstantBias())
     >>> values.insert(L(0), np.array([0.0, 2.0, 0.0]))
-    >>> keys = {"state": X(0), "bias": B(0), "lever_arm_m": L(0)}
+    >>> keys = {"state": X(0), "state_after": X(1), "bias": B(0), "lever_arm_m": L(0)}
     >>> factor = fd.sensor_factor(velocity, dvl.parameters(), chain, 0, keys, values)
     >>> (0.1 * factor.unwhitenedError(values)).round(3) + 0.0
     array([-0.2,  0. ,  0. ])
     """
-    unknown = set(keys) - {"state", "bias", *(p.name for p in parameters)}
+    own = ["state", "bias", "state_after", *(["bias_after"] if "bias_after" in keys else [])]
+    unknown = set(keys) - {*own, *(p.name for p in parameters)}
     if unknown:
         raise KeyError(f"{', '.join(sorted(unknown))}: no parameter of the sensor")
     fixed = {p.name: prior_mean(p) for p in parameters}
@@ -377,22 +408,24 @@ def sensor_factor(
     (index,) = np.nonzero(node == k)
     if not index.size:
         raise ValueError(f"{observation.label} has no measurement between node {k} and the next")
-    some = ObservationRows(observation, index)
-    bound, _ = bind(_inertial(chain).from_node(np.array([k])), [some], (), {}, clock_zero)
+    local = _inertial(chain, walking="bias_after" in keys).from_node(np.array([k]))
+    bound, _ = bind(local, [ObservationRows(observation, index)], (), {}, clock_zero)
     measured = NodeMeasurements(tuple(bound), free, fixed)
-    states = state_of(values.atNavState(keys["state"]), values.atConstantBias(keys["bias"]))
-    weight = 1.0 / measured.sigma(measured.motions(states, given), given, {})
-    shared = [keys[p.name] for p in free]
-    return measurement_factor(measured, weight, keys["state"], keys["bias"], shared)
+    nodes = [keys[name] for name in own]
+    _, _, motions, missing = measured.linearize(states_at(values, nodes), given)
+    weight = 1.0 / measured.sigma(motions, missing, given, {})
+    return measurement_factor(measured, weight, nodes, [keys[p.name] for p in free])
 
 
-def _inertial(chain: Preintegration) -> ForwardChain:
+def _inertial(chain: Preintegration, *, walking: bool) -> InertialChain:
     """Return the chain of a preintegration, without its factors."""
-    biases = chain.imu.parameters(0.0)
-    graph = gtsam.NonlinearFactorGraph()
-    return ForwardChain(
-        chain.frame, chain.segments, chain.gravity_n, biases, biases, chain.imu.settings, graph
-    )
+    biases, graph = chain.imu.parameters(0.0), gtsam.NonlinearFactorGraph()
+    imu = chain.imu.settings
+    if not walking:
+        imu = msgspec.structs.replace(
+            imu, gyro_bias_walk_deg_h_sqrt_h=0.0, accel_bias_walk_ug_sqrt_h=0.0
+        )
+    return InertialChain(chain.frame, chain.segments, chain.gravity_n, biases, biases, imu, graph)
 
 
 def measured_nodes(
@@ -437,4 +470,4 @@ def nodes_before(
     """Return the nodes before measurements (M,), -1 outside the chain."""
     time = time_on_chain(observation, values, clock_zero, None)
     inside = (time > chain.time[0] - _ROUNDING) & (time < chain.time[-1] + _ROUNDING)
-    return np.where(inside, _inertial(chain).attach(time).node, -1)
+    return np.where(inside, _inertial(chain, walking=False).attach(time).node, -1)

@@ -18,7 +18,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array, IntArray, median
 from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_steps
-from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
+from factorgraph_dvl.imu.interpolation import Smoothed, Smoothing, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.message import message
@@ -89,13 +89,13 @@ class Increments(ArcPolynomials):
         open: lost ones, or a step between two of them; else 0.
     accel_sigma : float
         Standard deviation of one sample of the force from its noise, m/s².
-    windows : tuple of (int, int), optional
-        Samples over which rate and force are smoothed; None = chosen from the record.
+    smoothing : tuple of (Smoothing, Smoothing), optional
+        How rate and force are smoothed; None = chosen from the record.
     """
 
     open_sigma: Array
     accel_sigma: float
-    windows: tuple[int, int] | None = None
+    smoothing: tuple[Smoothing, Smoothing] | None = None
 
     @cached_property
     def fastest(self) -> float:
@@ -184,7 +184,7 @@ class Increments(ArcPolynomials):
             else:
                 omega[mine], alpha[mine], misfit = rate.at(time[mine])
                 # If a measurement follows vibration, its residuals show that.
-                between = 0.0 if rate.vibrates else unresolved[mine]
+                between = 0.0 if rate.by.vibration else unresolved[mine]
                 unresolved[mine] = np.hypot(between, misfit)
         return {
             "omega": omega,
@@ -204,10 +204,10 @@ class Increments(ArcPolynomials):
             yield slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc), signals
 
     @property
-    def chosen_windows(self) -> tuple[int, int]:
-        """Samples over which rate and force of the last arc are smoothed; 0 = not at all."""
+    def chosen_smoothing(self) -> tuple[Smoothing, Smoothing]:
+        """How rate and force of the last arc are smoothed."""
         rate, force = self.smoothed[-1]
-        return rate.window, force.window
+        return rate.by, force.by
 
     def release(self) -> None:
         """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
@@ -247,16 +247,16 @@ class Increments(ArcPolynomials):
     ) -> tuple[Smoothed, Smoothed]:
         if not regular:
             return unsmoothed(dt, self.gyro_sigma), unsmoothed(dt, self.accel_sigma)
-        by_rate, by_force = (None, None) if self.windows is None else self.windows
+        by_rate, by_force = (None, None) if self.smoothing is None else self.smoothing
         return (
-            smooth(time, rate, dt, self.gyro_sigma, averaged=self.averaged, window=by_rate),
+            smooth(time, rate, dt, self.gyro_sigma, averaged=self.averaged, by=by_rate),
             smooth(
                 time,
                 force,
                 dt,
                 self.accel_sigma,
                 averaged=self.averaged,
-                window=by_force,
+                by=by_force,
                 with_misfit=False,
             ),
         )
@@ -288,7 +288,7 @@ class Increments(ArcPolynomials):
 
 
 def increments(
-    imu: Imu, windows: tuple[int, int] | None = None
+    imu: Imu, smoothing: tuple[Smoothing, Smoothing] | None = None
 ) -> tuple[Increments, tuple[Finding, ...]]:
     """Return increments between the samples of an IMU, and what had to be bridged.
 
@@ -296,7 +296,7 @@ def increments(
     ----------
     imu : Imu
         Record of the IMU.
-    windows : tuple of (int, int), optional
+    smoothing : tuple of (Smoothing, Smoothing), optional
         See `Increments`.
 
     Returns
@@ -329,7 +329,7 @@ def increments(
     out = _increments(
         imu.settings,
         median(np.diff(imu.time)),
-        windows,
+        smoothing,
         start=np.concatenate([time[a] + e[:-1] for (a, _), e in zip(whole, edges, strict=True)]),
         dt=np.concatenate([np.diff(e) for e in edges]),
         arcs=np.stack([np.concatenate([[0], ends[:-1]]), ends], axis=1),
@@ -347,7 +347,7 @@ def unbroken_increments(
     time: Array,
     rate: Array,
     force: Array,
-    windows: tuple[int, int],
+    smoothing: tuple[Smoothing, Smoothing],
     wanted: slice,
 ) -> Increments:
     """Return increments between samples of which none was lost, with times as they are.
@@ -362,7 +362,7 @@ def unbroken_increments(
         Times of the samples, `_LEAST` at least.
     rate, force : ndarray, shape (S, 3)
         The samples.
-    windows : tuple of (int, int)
+    smoothing : tuple of (Smoothing, Smoothing)
         See `Increments`.
     wanted : slice
         The samples between which increments are wanted, `_LEAST` at least.
@@ -378,7 +378,7 @@ def unbroken_increments(
     out = _increments(
         settings,
         usual,
-        windows,
+        smoothing,
         start=start,
         dt=dt,
         arcs=np.array([[0, dt.size]]),
@@ -392,7 +392,10 @@ def unbroken_increments(
 
 
 def _increments(
-    settings: ImuSettings, step: float, windows: tuple[int, int] | None, **arrays: Array
+    settings: ImuSettings,
+    step: float,
+    smoothing: tuple[Smoothing, Smoothing] | None,
+    **arrays: Array,
 ) -> Increments:
     """Return increments of these arrays, and of the noise of samples every `step` s."""
     root_step = math.sqrt(step)
@@ -402,7 +405,7 @@ def _increments(
         averaged=averaged,
         gyro_sigma=settings.gyro_noise_root_psd / root_step,
         accel_sigma=settings.accel_noise_root_psd / root_step,
-        windows=windows,
+        smoothing=smoothing,
     )
     if not averaged:
         noise = np.repeat([out.gyro_sigma, out.accel_sigma], 3)

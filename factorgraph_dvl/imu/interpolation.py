@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval, polyvander
@@ -62,6 +63,21 @@ _BESIDE = 50
 _STEP = 4.0
 
 
+class Smoothing(NamedTuple):
+    """How a signal is smoothed.
+
+    Parameters
+    ----------
+    window : int
+        Number of samples that each value is made of, 0 where they are left alone.
+    vibration : float, default 0
+        Mean square of the vibration in the samples.
+    """
+
+    window: int
+    vibration: float = 0.0
+
+
 @dataclass(frozen=True)
 class Smoothed:
     """A signal of three axes over one arc without gaps.
@@ -74,18 +90,15 @@ class Smoothed:
         What the window does not resolve, over time; None where nothing, or where not asked for.
     sigma, slope_sigma : float
         Standard deviation of value and derivative from the noise.
-    window : int
-        Number of samples that each value is made of, 0 where they are left alone.
-    vibrates : bool, default False
-        Whether vibration was taken out of the samples.
+    by : Smoothing
+        How it is smoothed.
     """
 
     spline: BSpline | None
     misfit: BSpline | None
     sigma: float
     slope_sigma: float
-    window: int
-    vibrates: bool = False
+    by: Smoothing
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return value, derivative and what is not resolved at times, (M, 3) each."""
@@ -104,13 +117,11 @@ class Smoothed:
 
 def unsmoothed(dt: float, sigma: float) -> Smoothed:
     """Return a signal that is not smoothed, with its noise."""
-    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, 0)
+    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, Smoothing(0))
 
 
-def best_window(values: Array, dt: float, sigma: float) -> tuple[int, float]:
-    """Return the window with the least error of noise and motion together, 0 for none.
-
-    The mean square of the vibration comes with it.
+def best_smoothing(values: Array, dt: float, sigma: float) -> Smoothing:
+    """Return the window with the least error of noise and motion together, and the vibration.
 
     What a window takes of a sway that goes on is alike in many measurements, and counts as often.
     So does vibration that it leaves: no measurement is known to follow it.
@@ -135,7 +146,7 @@ def best_window(values: Array, dt: float, sigma: float) -> tuple[int, float]:
         error = by_motion + goes_on + sigma**2 * kept
         if error < best:
             best, width = error, window
-    return width, power
+    return Smoothing(width, power)
 
 
 def _vibration(values: Array, dt: float, sigma: float) -> tuple[Array | None, float]:
@@ -179,7 +190,7 @@ def smooth(
     sigma: float,
     *,
     averaged: bool,
-    window: int | None = None,
+    by: Smoothing | None = None,
     with_misfit: bool = True,
 ) -> Smoothed:
     """Smooth a signal.
@@ -196,16 +207,17 @@ def smooth(
         Standard deviation of a sample.
     averaged : bool
         Whether samples are means over their intervals.
-    window : int, optional
-        Number of samples; None = `best_window`.
+    by : Smoothing, optional
+        How; None = `best_smoothing`.
     with_misfit : bool, default True
         Whether to find what the window does not resolve.
     """
-    width, vibration = best_window(values, dt, sigma) if window is None else (window, 0.0)
+    by = best_smoothing(values, dt, sigma) if by is None else by
+    width = by.window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
     # Vibration is no step: if a measurement follows it, its residuals show that.
-    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(vibration)))
+    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(by.vibration)))
     misfit: Array | None
     if values.shape[0] > _SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
@@ -221,8 +233,7 @@ def smooth(
         misfit=line,
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * slope_gain(width) / dt,
-        window=width,
-        vibrates=vibration > 0.0,
+        by=by,
     )
 
 

@@ -340,28 +340,6 @@ def extrapolated(motion: Motion, late: Array) -> Motion:
     )
 
 
-def later(at: Attachment, late: Array, earth_rate_n: Array) -> Attachment:
-    """Return an attachment at times that are later by (M,) s, to the same nodes.
-
-    As `extrapolated`, with the derivatives by the nodes.
-    """
-    h = late[:, None]
-    gyro = at.gyro + at.alpha * h
-    tau = at.tau + late
-    turned = rotate(at.dR, at.force) * h
-    turned_by, turn = exp_so3(np.array([0.5 * (at.gyro + gyro) * h, -tau[:, None] * earth_rate_n]))
-    return replace(
-        at,
-        tau=tau,
-        dR=at.dR @ turned_by,
-        dA=at.dA + at.dR * h[:, :, None],
-        dV=at.dV + turned,
-        dP=at.dP + at.dV * h + 0.5 * turned * h,
-        gyro=gyro,
-        turn=turn,
-    )
-
-
 def with_bias(at: Attachment, states: States) -> tuple[Array, Array, Array]:
     """Return dR (M, 3, 3), dV, dP (M, 3), corrected to first order for the biases."""
     bg, ba = states.gyro_bias[at.node], states.accel_bias[at.node]

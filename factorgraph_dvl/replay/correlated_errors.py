@@ -186,7 +186,7 @@ class CorrelatedErrors:
                 _, i = self.walks[o.label]
                 own[:, :, i] = self.sigma[i] * o.scale_walk.measured
             rows.append(own.reshape(-1, self.size))
-            after = np.clip(b.attachment.tau / duration, 0.0, 1.0)
+            after = np.clip(b.attachment.forward.tau / duration, 0.0, 1.0)
             shares.append(after.repeat(len(o.components)))
         whole, share = np.concatenate(rows), np.concatenate(shares)[:, None]
         return (1.0 - share) * whole, share * whole

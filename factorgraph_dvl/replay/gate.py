@@ -146,9 +146,8 @@ def _mean_square(row: list[float]) -> float:
 def gated(
     measured: NodeMeasurements,
     residual: Array,
-    jacobian: Array,
+    variance: Array,
     sigma: Array,
-    P: Array,
     gate: InnovationGate,
 ) -> tuple[list[Array], list[Innovations], list[Finding]]:
     """Return inverse standard deviations of measurements, 0 for those that the gate rejects.
@@ -159,12 +158,10 @@ def gated(
         Measurements of R components in all.
     residual : ndarray, shape (R,)
         Predicted - measured.
-    jacobian : ndarray, shape (R, 15 + n)
-        Derivatives with respect to state, bias and the n parameters.
+    variance : ndarray, shape (R,)
+        Variance of the prediction.
     sigma : ndarray, shape (R,)
         Standard deviation of the residual without that of the prediction.
-    P : ndarray, shape (15 + n, 15 + n)
-        Joint covariance of these.
     gate : InnovationGate
         Gate, which remembers what it sees.
 
@@ -178,7 +175,7 @@ def gated(
         What the gate noticed.
     """
     there = np.isfinite(sigma)
-    total = np.sqrt(((jacobian @ P) * jacobian).sum(axis=1) + sigma**2)
+    total = np.sqrt(variance + sigma**2)
     all_found, all_spread = np.where(there, (residual, total), np.nan)
     weights, innovations, findings = [], [], []
     first = 0

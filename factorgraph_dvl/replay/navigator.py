@@ -15,8 +15,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
+from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import (
@@ -24,7 +24,7 @@ from factorgraph_dvl.graph.sensor_factor import (
     NodeMeasurements,
     bind,
     measurement_factor,
-    state_of,
+    states_of,
 )
 from factorgraph_dvl.graph.trajectory import (
     TRAJECTORY_RATE,
@@ -42,6 +42,7 @@ from factorgraph_dvl.replay.record import Innovations
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
 from factorgraph_dvl.replay.start import ReplayStart
+from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
 
@@ -87,7 +88,7 @@ class _LinearizationPoint:
 class _Segment:
     """A segment as a chain of its own, and the epochs in it."""
 
-    chain: ForwardChain
+    chain: InertialChain
 
     @cached_property
     def epochs(self) -> Epochs:
@@ -201,9 +202,9 @@ class Navigator:
         s = self.smoother
         k = s.node
         state, bias = s.state(k), s.bias(k)
-        states = state_of(state, bias)
         duration = float(seg.duration[0])
-        gravity = self._gravity.at(states.p_n + 0.5 * duration * states.v_n)
+        middle = state.position() + 0.5 * duration * state.velocity()
+        gravity = self._gravity.at(middle[None])
         chain = self.start.chain.following(seg, gravity, k)
         self._segments[k] = _Segment(chain)
         measured, imu_errors = self._bound(chain, aids)
@@ -214,7 +215,6 @@ class Navigator:
             predicted = predicted.retract(imu_errors.ends(self.values)[0])
             (motion,) = imu_errors.factors(chain.graph)
         factors.add(motion)
-        # By its name GTSAM finds the overload in a third of the time.
         values.insert(keys.node(k + 1), nav_state=predicted)
         if self.start.walking:
             factors.add(chain.graph.at(1))
@@ -225,7 +225,7 @@ class Navigator:
             values.insert(keys.correlated(k + 1), errors.after(duration) * s.errors(k))
         end = float(seg.node_time[1])
         if measured is not None:
-            self._add_factor(factors, k, measured)
+            self._add_factor(factors, k, measured, motion, predicted)
         s.extend(end, factors, values)
         if self._linear is not None:
             if not self.start.walking:
@@ -244,15 +244,19 @@ class Navigator:
         """Add measurements that arrived late, by the index of the state before them."""
         factors = gtsam.NonlinearFactorGraph()
         for k, records in aids.items():
-            measured, _ = self._bound(self._segments[k].chain, records)
+            chain = self._segments[k].chain
+            measured, imu_errors = self._bound(chain, records)
             if measured is not None:
-                self._add_factor(factors, k, measured)
+                motion = chain.graph.at(0)
+                if imu_errors is not None:
+                    (motion,) = imu_errors.factors(chain.graph)
+                self._add_factor(factors, k, measured, motion)
         if factors.size():
             self.smoother.correct(factors, min(aids))
             self._refresh()
 
     def _bound(
-        self, chain: ForwardChain, aids: Sequence[Aid]
+        self, chain: InertialChain, aids: Sequence[Aid]
     ) -> tuple[NodeMeasurements | None, ImuErrors | None]:
         """Return what was measured in a segment, None if nothing, and errors of the IMU there."""
         start = self.start
@@ -353,35 +357,65 @@ class Navigator:
         self.values = {**self.start.fixed, **self.smoother.calibration()}
 
     def _add_factor(
-        self, factors: gtsam.NonlinearFactorGraph, k: int, measured: NodeMeasurements
+        self,
+        factors: gtsam.NonlinearFactorGraph,
+        k: int,
+        measured: NodeMeasurements,
+        motion: gtsam.NonlinearFactor,
+        predicted: gtsam.NavState | None = None,
     ) -> None:
-        """Add the factor of measurements after state k that the gate accepts."""
-        s = self.smoother
+        """Add the factor of measurements after state k that the gate accepts.
+
+        Parameters
+        ----------
+        factors : gtsam.NonlinearFactorGraph
+            Added to.
+        k : int
+            State.
+        measured : NodeMeasurements
+            What was measured between it and the next.
+        motion : gtsam.NonlinearFactor
+            Factor of the IMU between both.
+        predicted : gtsam.NavState, optional
+            The next state where it is yet to come.
+        """
+        s, walking = self.smoother, self.start.walking
         names = tuple(p.name for p in measured.parameters)
         if names not in self._own:
             own = np.arange(STATE_SIZE + BIAS_SIZE)
             self._own[names] = np.append(own, own.size + self.start.columns(names))
         own = self._own[names]
-        first = None
-        if self._linear is not None and k == s.node:
-            # Where GTSAM will linearise, so this is done once only.
-            at = self._linear
-            states = state_of(at.state, at.bias)
-            residual, matrix, motions = measured.linearize(states, at.parameters)
-            first = Linearized(at.state, at.bias, at.parameters, residual, matrix)
-            residual = residual + matrix @ self._local_coordinates(at)[own]
-        else:
-            states = state_of(s.state(k), s.bias(k))
-            residual, matrix, motions = measured.linearize(states, self.values)
-        sigma = measured.sigma(motions, self.values, self.start.noise_factors)
+        after = s.state(k + 1) if predicted is None else predicted
+        bias_after = s.bias(k if predicted is not None else k + 1)
+        # Where GTSAM will linearise what is new, so this is done once only.
+        at = None if predicted is None else self._linear
+        state, bias = (s.state(k), s.bias(k)) if at is None else (at.state, at.bias)
+        parameters = self.values if at is None else at.parameters
+        states = states_of([state, after], [bias, bias_after] if walking else [bias])
+        residual, matrix, motions, missing = measured.linearize(states, parameters)
+        first = None if at is None else Linearized(states, parameters, residual, matrix)
+        if at is not None:
+            by_known = np.delete(matrix, self._of_node_after, axis=1)
+            residual = residual + by_known @ self._local_coordinates(at)[own]
+        there = gtsam.Values()
+        # By its name GTSAM finds the overload in a third of the time.
+        there.insert(keys.node(k), nav_state=state)
+        there.insert(keys.node(k + 1), nav_state=after)
+        there.insert(s.bias_key(k), constant_bias=bias)
+        for p in measured.parameters:
+            if p.name in ERRORS:
+                there.insert(s.calibration_keys[p.name], parameters[p.name])
+        jacobian, added = self._from_before(measured, matrix, motion.linearize(there))
+        sigma = measured.sigma(motions, missing, self.values, self.start.noise_factors)
         errors = None
         if self.start.errors.size:
             errors, error = self._correlated_errors(k, measured)
             residual = residual + error
-            matrix = np.hstack([matrix, sum(errors.values())])
+            jacobian = np.hstack([jacobian, sum(errors.values())])
             own = np.append(own, np.arange(len(self._P), len(self._P_with_errors)))
         P = self._P_with_errors[own[:, None], own]
-        weights, innovations, findings = gated(measured, residual, matrix, sigma, P, self._gate)
+        added += ((jacobian @ P) * jacobian).sum(axis=1)
+        weights, innovations, findings = gated(measured, residual, added, sigma, self._gate)
         self.innovations += innovations
         self.findings += findings
         state_P = self._P[:STATE_SIZE, :STATE_SIZE]
@@ -390,8 +424,49 @@ class Navigator:
         weight = np.concatenate([w.ravel() for w in weights])
         if weight.any():
             shared = [s.calibration_keys[name] for name in names]
-            node, bias = keys.node(k), s.bias_key(k)
-            factors.add(measurement_factor(measured, weight, node, bias, shared, first, errors))
+            nodes = [int(key) for (key,) in self.start.chain.variables(np.array([[k]]))]
+            factors.add(measurement_factor(measured, weight, nodes, shared, first, errors))
+
+    @property
+    def _of_node_after(self) -> slice:
+        """Columns of measurements by the node after."""
+        return slice(STATE_SIZE + BIAS_SIZE, sum(self.start.chain.sizes))
+
+    def _from_before(
+        self, measured: NodeMeasurements, matrix: Array, motion: gtsam.GaussianFactor
+    ) -> tuple[Array, Array]:
+        """Return derivatives of measurements by what was known at the node before.
+
+        The node after is that node carried by the IMU, of which the noise adds a variance (R,).
+
+        Parameters
+        ----------
+        measured : NodeMeasurements
+            Measurements of R components in all.
+        matrix : ndarray, shape (R, c + n)
+            Derivatives by the variables of both nodes and by n parameters.
+        motion : gtsam.GaussianFactor
+            Factor of the IMU, linear: states, bias, errors.
+        """
+        step = motion.augmentedJacobian()[:, :-1]
+        before, after, bias, by_errors = np.split(
+            step, np.cumsum([STATE_SIZE, STATE_SIZE, BIAS_SIZE]), axis=1
+        )
+        of_after = matrix[:, self._of_node_after]
+        by_noise = of_after[:, :STATE_SIZE] @ np.linalg.inv(after)
+        out = np.delete(matrix, self._of_node_after, axis=1)
+        out[:, :STATE_SIZE] -= by_noise @ before
+        out[:, STATE_SIZE : STATE_SIZE + BIAS_SIZE] -= by_noise @ bias
+        if self.start.walking:
+            out[:, STATE_SIZE : STATE_SIZE + BIAS_SIZE] += of_after[:, STATE_SIZE:]
+        place = STATE_SIZE + BIAS_SIZE
+        for p in measured.parameters:
+            size = p.mean.size
+            if p.name in ERRORS:
+                own, by_errors = by_errors[:, :size], by_errors[:, size:]
+                out[:, place : place + size] -= by_noise @ own
+            place += size
+        return out, np.sum(by_noise**2, axis=1)
 
     def _correlated_errors(
         self, k: int, measured: NodeMeasurements
@@ -428,7 +503,7 @@ def _as_trajectory(
     body_axes: BodyAxes,
 ) -> Trajectory:
     """Return a state with its covariance (9, 9), in GTSAM's tangent space, at a time, s."""
-    states = state_of(state, bias)
+    states = states_of([state], [bias])
     lat, lon, height = frame.geodetic(states.p_n)
     lRn = frame.level_from_tangent(lat, lon)
     lRb = lRn @ states.nRb

@@ -17,7 +17,6 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import (
     consistency_findings,
     not_observable,
-    windows_left_out,
 )
 from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord, Update
@@ -275,10 +274,9 @@ def _solution(
                 "IMU",
             )
         )
-    if trial.imu is not None:
-        if trial.dvl is not None and "scale_walk_std_sqrt_h" in trial.dvl.settings.left_out:
-            findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
-        findings += windows_left_out(trial.aids)
+    dvl = None if trial.imu is None else trial.dvl
+    if dvl is not None and "scale_walk_std_sqrt_h" in dvl.settings.left_out:
+        findings.append(Finding(Code.MEAN_OR_LAST, message("mean_or_last.scale"), "DVL"))
     if run.unused >= LEAST:
         findings.append(Finding(Code.NOT_CONVERGED, message("not_converged.replay")))
     elif last.inconsistent:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.imu.increments import MAX_FILLED, increments, unbroken_increments
+from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.imu.preintegration import Segments, one_segment
 from factorgraph_dvl.imu.timestamps import unrounded
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings, within_limits
@@ -59,8 +61,10 @@ class SampleBuffer:
     ----------
     dt : float
         Sample interval, s; 0 until it is known.
-    windows : tuple of (int, int)
-        Widths in samples over which gyros and accelerometers are smoothed.
+    smoothing : tuple of (Smoothing, Smoothing)
+        How gyros and accelerometers are smoothed.
+    longest : float
+        Length of the longest window over which a sensor averages, s.
     rejected, interpolated : int
         Number of samples that were not used, and of those that were lost and interpolated.
     """
@@ -72,7 +76,8 @@ class SampleBuffer:
         self._time, self._number = np.empty((2, 0))
         self._stale: list[Array] = []
         self.dt = 0.0
-        self.windows: tuple[int, int] = (0, 0)
+        self.smoothing = Smoothing(0), Smoothing(0)
+        self.longest = 0.0
         self.rejected = 0
         self.interpolated = 0
 
@@ -84,7 +89,13 @@ class SampleBuffer:
     @property
     def side(self) -> int:
         """Samples needed after a segment before it can be integrated."""
-        return _SIDE + max(self.windows) // 2
+        return self._near + max(by.window for by in self.smoothing) // 2
+
+    @property
+    def _near(self) -> int:
+        """Samples beside a segment that its polynomials, and windows about its times, reach."""
+        averaged = math.ceil(0.5 * self.longest / self.dt) if self.longest else 0
+        return _SIDE + averaged
 
     @property
     def delay(self) -> float:
@@ -236,12 +247,12 @@ class SampleBuffer:
         signals = part[:, 1:4], part[:, 4:7]
         if number[-1] - number[0] == high - low - 1:
             # Polynomials need their neighbours only, smoothing all of its window.
-            near = slice(max(a - low - _SIDE, 0), b - low + _SIDE + 1)
-            inc = unbroken_increments(self._settings, time, *signals, self.windows, near)
+            near = slice(max(a - low - self._near, 0), b - low + self._near + 1)
+            inc = unbroken_increments(self._settings, time, *signals, self.smoothing, near)
             # Means end at their times.
             before = low + near.start - inc.averaged
             return one_segment(inc, a - before, b - before)
-        inc, _ = increments(Imu(self._settings, time, *signals), self.windows)
+        inc, _ = increments(Imu(self._settings, time, *signals), self.smoothing)
         first = int(np.argmin(np.abs(inc.start - time[a - low])))
         last = int(np.argmin(np.abs(inc.end - time[b - low]))) + 1
         self.interpolated += last - first - (b - a)

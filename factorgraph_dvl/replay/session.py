@@ -104,8 +104,6 @@ class Replay:
                 expected="an imu section",
                 hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
             )
-        # A window would reach beyond the newest samples.
-        settings = settings.without_windows()
         self._findings: list[Finding] = []
         self._settings = settings
         self._sections = tuple(aid.section for aid in settings.aids)
@@ -323,7 +321,7 @@ class Replay:
         self._noise = start.noise
         lag = self._lag if self._kind == "fixed-lag" else None
         self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
-        self._samples.windows = start.windows
+        self._samples.smoothing, self._samples.longest = start.smoothing, start.longest
         self._smoothed_to = start.node
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.
         gc.collect()

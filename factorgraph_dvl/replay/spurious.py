@@ -86,7 +86,7 @@ class SpuriousInformation:
                 continue
             part = spurious_by(
                 o,
-                b.attachment,
+                b.attachment.forward,
                 motion,
                 weight,
                 P[None],

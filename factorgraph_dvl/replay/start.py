@@ -14,11 +14,11 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.forward_chain import ForwardChain
 from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
+from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
@@ -45,7 +45,7 @@ class ReplayStart:
 
     Parameters
     ----------
-    chain : ForwardChain
+    chain : InertialChain
         What the segments to come follow.
     body_axes : BodyAxes
         Axes of the body.
@@ -67,8 +67,10 @@ class ReplayStart:
         Whether there are ranges to beacons.
     own_states : tuple of str
         Sections of the sensors whose every measurement needs a state of its own.
-    windows : tuple of (int, int)
-        Widths in samples over which gyros and accelerometers are smoothed.
+    smoothing : tuple of (Smoothing, Smoothing)
+        How gyros and accelerometers are smoothed.
+    longest : float
+        Length of the longest window over which a sensor averages, s.
     spurious : ndarray, shape (P, P)
         Spurious information on the parameters, in units of the priors' standard deviations.
     noise_factors : mapping of str to ndarray
@@ -90,7 +92,7 @@ class ReplayStart:
         Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
-    chain: ForwardChain
+    chain: InertialChain
     body_axes: BodyAxes
     node: int
     time: float
@@ -102,7 +104,8 @@ class ReplayStart:
     sections: tuple[str, ...]
     ranges: bool
     own_states: tuple[str, ...]
-    windows: tuple[int, int]
+    smoothing: tuple[Smoothing, Smoothing]
+    longest: float
     spurious: Array
     noise_factors: Mapping[str, Array]
     noise: tuple[Noise, ...]
@@ -184,13 +187,9 @@ def solve_start(
     if not minimum.converged:
         return message("not_started.not_converged")
     covariances = posterior(problem, minimum)
-    attitude = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][:3, :3])[-1]))
-    if not attitude < _ATTITUDE:
-        return message("not_started.attitude", std=np.degrees(attitude))
-    if trial.beacons is not None:
-        position = float(np.sqrt(np.linalg.eigvalsh(covariances.nodes[-1][3:6, 3:6])[-1]))
-        if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
-            return message("not_started.position", std=position)
+    unsure = _not_linear(trial, covariances.nodes[-1])
+    if unsure is not None:
+        return unsure
     evaluation = minimum.evaluation
     # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
@@ -207,7 +206,7 @@ def solve_start(
     eliminated = [key for key in evaluation.values.dims() if not values.exists(key)]
     _, rest = gaussian.eliminatePartialMultifrontal(eliminated, gtsam.EliminateQR)
     return ReplayStart(
-        chain=ForwardChain.of(chain),
+        chain=chain,
         body_axes=trial.body_axes,
         node=last,
         time=time,
@@ -219,7 +218,10 @@ def solve_start(
         sections=tuple(aid.section for aid in trial.aids),
         ranges=trial.beacons is not None,
         own_states=_own_states(trial, chain.frame, interval),
-        windows=chain.segments.increments.chosen_windows,
+        smoothing=chain.segments.increments.chosen_smoothing,
+        longest=max(
+            (abs(b.window(evaluation.parameters) or 0.0) for b in problem.bound), default=0.0
+        ),
         spurious=spurious,
         noise_factors=problem.white_factors,
         noise=noise_of(problem),
@@ -234,6 +236,18 @@ def solve_start(
         findings=settled.findings,
         misfit=_misfit(problem, evaluation),
     )
+
+
+def _not_linear(trial: Trial, P: Array) -> Message | None:
+    """Return why a smoother may not be linearised at a state of covariance P (9, 9), if so."""
+    attitude = float(np.sqrt(np.linalg.eigvalsh(P[:3, :3])[-1]))
+    if not attitude < _ATTITUDE:
+        return message("not_started.attitude", std=np.degrees(attitude))
+    if trial.beacons is not None:
+        position = float(np.sqrt(np.linalg.eigvalsh(P[3:6, 3:6])[-1]))
+        if not position < _linear_std(trial.beacons.range, trial.beacons.settings.range_std_m):
+            return message("not_started.position", std=position)
+    return None
 
 
 def _linear_std(ranges: Array, std: float) -> float:

@@ -48,6 +48,8 @@ HORIZONTAL_AND_UP = ((0, 1), (2,))
 
 # Plausible size, m. Chosen: a vessel's length, for an antenna that was not measured.
 _LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b", nuisance=True, plausible=5.0)
+# Correlation time of velocities where none is stated, s. Chosen: that of filters in receivers.
+_VELOCITY_TIME = 2.0
 # Rate of the body relative to itself.
 _AT_REST = np.zeros(3)
 _AT_REST.setflags(write=False)
@@ -282,7 +284,10 @@ class Gnss:
                     omega_cb_b=omega_cb_b,
                     noise_groups=HORIZONTAL_AND_UP,
                     correlated=expected_correlation(
-                        s.velocity_correlation_time_s, s.correlated_velocity_std_m_s, 3
+                        s.velocity_correlation_time_s,
+                        s.correlated_velocity_std_m_s,
+                        3,
+                        _VELOCITY_TIME,
                     ),
                 )
             )

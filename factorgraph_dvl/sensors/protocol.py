@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
 
@@ -438,3 +438,11 @@ def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:
     Across the lever arm, (3,) or (M, 3), where it is largest.
     """
     return np.sqrt(cross_variance(motion.omega_sigma, lever_arm**2))
+
+
+def observed(
+    aids: Sequence[Aid], frame: LocalFrame, body_axes: BodyAxes
+) -> tuple[tuple[Observation, ...], tuple[Parameter, ...]]:
+    """Return the measurements and the calibration parameters of aiding sensors."""
+    observations = tuple(o for aid in aids for o in aid.observations(frame, body_axes))
+    return observations, tuple(p for aid in aids for p in aid.parameters())

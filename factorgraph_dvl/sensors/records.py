@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factorgraph_dvl.errors import DataError
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, spread
 from factorgraph_dvl.settings.ranges import SWAPPED, could_be_longitude, range_of
 
 # Weights of the samples two before, one before, one after and two after, through which a cubic
@@ -172,4 +172,4 @@ def white_noise(values: Array) -> Array:
     after = _NEIGHBOURS[2] * values[3:-1] + _NEIGHBOURS[3] * values[4:]
     missed = values[2:-2] - before - after
     gain = np.sqrt(1.0 + _NEIGHBOURS @ _NEIGHBOURS)
-    return np.asarray(1.4826 * np.median(np.abs(missed), axis=0) / gain)
+    return spread(missed) / gain

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import inertial_chain
 from factorgraph_dvl.graph.priors import prior_mean
-from factorgraph_dvl.graph.problem import Evaluation, Problem, observed
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
@@ -24,7 +24,7 @@ from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.sensors.protocol import Observation, observed
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.fixed_directions import with_covariances

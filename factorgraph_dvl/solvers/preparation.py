@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.inertial_chain import InertialChain, inertial_chain
 from factorgraph_dvl.graph.priors import Tilt
-from factorgraph_dvl.graph.problem import Problem, observed
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.noise import with_recorded_noise
@@ -27,7 +27,7 @@ from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.sensors.protocol import Observation, observed
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.motion_strengths import Strengths

@@ -98,32 +98,48 @@ def _from(at: Estimated, **changes: Any) -> Proposal:
     return Proposal(replace(at.model, **changes), at.states, at.values)
 
 
-@dataclass
+class _Asked:
+    """Assumptions for which a step has asked what it asks once only."""
+
+    def __init__(self) -> None:
+        self._for: tuple[Any, ...] | None = None
+
+    def before(self, *assumptions: Any) -> bool:
+        """Whether these were the last that were noted."""
+        return _are_those(assumptions, self._for)
+
+    def note(self, *assumptions: Any) -> None:
+        """Note what need not be asked again."""
+        self._for = assumptions
+
+
 class MotionStrengths:
     """Strengths of a motion's prior, of processes and of white noise, by their likelihood."""
 
     name = "strengths of motion and noise"
-    _settled_for: tuple[Any, ...] | None = None
-    # Objective from which it last asked for another estimate.
-    _asked_at: float = np.inf
+
+    def __init__(self) -> None:
+        self._settled = _Asked()
+        # Objective from which it last asked for another estimate.
+        self._asked_at = np.inf
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield strengths that the residuals ask for, and others on the way there."""
         model = at.model
         # What other assumptions made of the noise is to be found anew.
         own = model.parameters, model.robust_weights, _labels(model)
-        if _are_those(own, self._settled_for):
+        if self._settled.before(*own):
             return
         found = model.prepared.strengths(at.problem, at.minimum)
         if found is None:
-            self._settled_for = own
+            self._settled.note(*own)
             return
         if self._asked_at - at.objective < LEAST_GAIN:
             # What one strength gains, others may lose, for ever.
             found = replace(found, same=True)
         self._asked_at = at.objective
         if found.same:
-            self._settled_for = own
+            self._settled.note(*own)
             self._asked_at = np.inf
         for share in _SHARES:
             yield _with_strengths(model, found, share)
@@ -169,21 +185,22 @@ class Gates:
             yield _from(at, rejected=found)
 
 
-@dataclass
 class Averaging:
     """Sensors that are stated to measure in no time: whether they average over a window."""
 
     name = "averaging"
-    _tested: tuple[Any, ...] | None = None
+
+    def __init__(self) -> None:
+        self._tested = _Asked()
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the length of a window, where the data show one."""
         model = at.model
         # Noise that persists is a part of the misfit until it is known.
         own = model.parameters, _labels(model)
-        if _are_those(own, self._tested) or at.rough or at.problem.chain.interpolates:
+        if self._tested.before(*own) or at.rough or at.problem.chain.interpolates:
             return
-        self._tested = own
+        self._tested.note(*own)
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
@@ -191,20 +208,21 @@ class Averaging:
         yield replace(_from(at, parameters=parameters), least_fall=sum(found.values()))
 
 
-@dataclass
 class GrossErrors:
     """Gross errors, by graduated truncation."""
 
     name = "gross errors"
-    _searched: int = 0
-    _for: tuple[Any, ...] | None = None
+
+    def __init__(self) -> None:
+        self._asked, self._searched = _Asked(), 0
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the gross errors that are found where all measurements count."""
         model, problem = at.model, at.problem
         own = model.parameters, model.prepared, _labels(model)
-        if not _are_those(own, self._for):
-            self._for, self._searched = own, 0
+        if not self._asked.before(*own):
+            self._asked.note(*own)
+            self._searched = 0
         if self._searched >= _SEARCHES:
             return
         self._searched += 1
@@ -223,20 +241,21 @@ class GrossErrors:
             yield Proposal(changed, there.states, there.parameters)
 
 
-@dataclass
 class Correlation:
     """Noise that persists: processes, or wide white noise where it lasts for seconds."""
 
     name = "correlation of noise"
-    _for: tuple[Any, ...] | None = None
+
+    def __init__(self) -> None:
+        self._asked = _Asked()
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the correlated noise that residuals show."""
         model, problem, minimum = at.model, at.problem, at.minimum
         own = model.parameters, model.prepared
-        if _are_those(own, self._for) or not minimum.converged:
+        if self._asked.before(*own) or not minimum.converged:
             return
-        self._for = own
+        self._asked.note(*own)
         found = correlated_noise(problem, minimum.evaluation, set(model.noise_factors))
         if found.gain > 0.0 and _changes_explain_more(problem, minimum, found.gain):
             # Noise that persists would take the place of what changed.
@@ -256,20 +275,21 @@ class Correlation:
         )
 
 
-@dataclass
 class Uncorrelated:
     """Noise that was found to persist: whether it still does, as other noise is known better."""
 
     name = "correlation that is none"
-    _for: tuple[Any, ...] | None = None
+
+    def __init__(self) -> None:
+        self._asked = _Asked()
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield models without one of the processes that were found."""
         model = at.model
         own = model.prepared, _labels(model)
-        if _are_those(own, self._for) or not at.minimum.converged:
+        if self._asked.before(*own) or not at.minimum.converged:
             return
-        self._for = own
+        self._asked.note(*own)
         stated = {p.label for p in model.stated_processes}
         for process in model.processes:
             if process.label not in stated and process.parameter is None:
@@ -284,14 +304,14 @@ class KnownParameters:
     name = "a parameter that was stated"
     freed: list[Explanation] = field(default_factory=list)
     left: Explanation | None = None
-    _tested: tuple[Any, ...] | None = None
+    _tested: _Asked = field(default_factory=_Asked)
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the most probable of these, with noise as stated and as found."""
         model, minimum = at.model, at.minimum
-        if not minimum.converged or model.parameters is self._tested:
+        if not minimum.converged or self._tested.before(model.parameters):
             return
-        self._tested = model.parameters
+        self._tested.note(model.parameters)
         # The test has a problem of its own, and more columns.
         at.problem.release()
         found = explanation(at.problem, minimum, model.prepared.trial.imu)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import chdtri
 
-from factorgraph_dvl.geometry.vectors import Array, BoolArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, spread
 from factorgraph_dvl.sensors.gross_errors import gross_errors, steps
 
 # Probability with which a good measurement passes the gate. Chosen: one in a thousand is lost.
@@ -37,7 +37,7 @@ def robust_scale(residuals: Array, least: Array | float = _LEAST_SCALE) -> Array
     for i, column in enumerate(step.T):
         known = column[np.isfinite(column)]
         if known.size:
-            out[i] = 1.4826 * np.median(np.abs(known - np.median(known)))
+            out[i] = spread(known - np.median(known))
     return np.maximum(out, least)
 
 
@@ -92,7 +92,7 @@ class Truncation:
         Where half of all residuals are larger than white noise makes them, the noise is
         correlated, and the gate goes by all of it.
         """
-        level = 1.4826 * np.nan_to_num(np.nanmedian(np.abs(residuals), axis=0))
+        level = np.nan_to_num(spread(residuals))
         relative = np.maximum(level / self._scale, 1.0)
         return np.asarray(self.squares(residuals / relative) > self._gate)
 

@@ -88,6 +88,9 @@ def test_a_campaign_survives_kills_and_solves_nothing_twice(run, tmp_path):
     content = json.loads((out / "campaign.json").read_text())
     assert [t["solved"] for t in content["trials"]].count(True) == 4
     assert content["joint"]["parameters"]["misalignment_deg"]["std"][2] < 0.1
+    shown = run("report", str(out))
+    assert shown.code != 0
+    assert "the result of a campaign" in shown.err
     # A result that was tampered with is solved again, and it alone.
     victim = out / "trials" / "0" / "calibration.json"
     victim.write_text("{}")

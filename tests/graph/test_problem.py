@@ -85,7 +85,7 @@ def test_rows_of_some_measurements_at_a_time_are_those_of_all(monkeypatch):
     evaluation = problem.evaluate(values)
     at_once = jacobians(problem, evaluation)
     problem.release()
-    for module in ("factor_layout", "problem"):
+    for module in ("factor_layout", "measurement_factors"):
         monkeypatch.setattr(f"factorgraph_dvl.graph.{module}.CHUNK", 7)
     in_parts = jacobians(problem, evaluation)
     for a, b in zip(at_once, in_parts, strict=True):
@@ -97,7 +97,7 @@ def test_nothing_holds_factors_that_are_eliminated():
     problem.weigh(problem.evaluate(values))
     evaluation = problem.evaluate(values)
     before = factorized(problem, evaluation)[1]
-    assert not any(block.factors for block in problem._blocks)
+    assert not any(block.factors for block in problem._factors.blocks)
     after = factorized(problem, evaluation)[1]
     assert after.equals(before, 0.0)
 

@@ -14,7 +14,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.forward_chain import ForwardChain
+from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.sensor_factor import (
     Linearized,
     NodeMeasurements,
@@ -22,9 +22,12 @@ from factorgraph_dvl.graph.sensor_factor import (
     measured_nodes,
     measurement_factor,
     sensor_factor,
+    states_at,
 )
+from factorgraph_dvl.imu.gtsam_measurements import preintegrate
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import one_segment, preintegrate
+from factorgraph_dvl.imu.interpolation import Smoothing
+from factorgraph_dvl.imu.preintegration import one_segment
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -51,11 +54,14 @@ ERRORS_FREE = FREE | {
 }
 
 
+NODES = [keys.node(0), keys.bias(0), keys.node(1)]
+
+
 def chain_of(imu, frame, seg, gravity_n):
     """The chain of a segment, without factors."""
     biases = imu.parameters(0.0)
     graph = gtsam.NonlinearFactorGraph()
-    return ForwardChain(frame, seg, gravity_n, biases, biases, imu.settings, graph)
+    return InertialChain(frame, seg, gravity_n, biases, biases, imu.settings, graph)
 
 
 def node_measurements(time=20.0, **changes):
@@ -70,11 +76,11 @@ def node_measurements(time=20.0, **changes):
         gyro=trial.imu.gyro[window],
         accel=trial.imu.accel[window],
     )
-    inc, _ = increments(imu, (0, 0))
+    inc, _ = increments(imu, (Smoothing(0), Smoothing(0)))
     first = int(np.argmin(np.abs(inc.start - time)))
     last = int(np.argmin(np.abs(inc.end - time - 1.0))) + 1
     seg = one_segment(inc, first, last)
-    states = exact_states(scene, frame, seg.node_time[:1])
+    states = exact_states(scene, frame, seg.node_time)
     values, observations = {}, []
     parameters = [p for aid in trial.aids for p in aid.parameters()]
     parameters += trial.imu.error_parameters()
@@ -86,7 +92,7 @@ def node_measurements(time=20.0, **changes):
         start, end = seg.node_time
         inside = np.flatnonzero((aid.time >= start) & (aid.time < end - 1e-6))
         observations += rows_of(aid, inside).observations(frame, "RFU")
-    middle = states.p_n + 0.5 * states.v_n
+    middle = states.p_n[:1] + 0.5 * states.v_n[:1]
     chain = chain_of(trial.imu, frame, seg, frame.gravity_without_rotation(middle))
     estimated = [p for p in parameters if p.estimated]
     some = {p.name: keys.calibration(i, p.mean.size) for i, p in enumerate(estimated)}
@@ -99,8 +105,9 @@ def node_measurements(time=20.0, **changes):
 
 def gtsam_values(measured, states, values):
     out = gtsam.Values()
-    nav = gtsam.NavState(gtsam.Rot3(states.nRb[0]), states.p_n[0], states.v_n[0])
-    out.insert(keys.node(0), nav)
+    for k in range(2):
+        nav = gtsam.NavState(gtsam.Rot3(states.nRb[k]), states.p_n[k], states.v_n[k])
+        out.insert(keys.node(k), nav)
     bias = gtsam.imuBias.ConstantBias(states.accel_bias[0], states.gyro_bias[0])
     out.insert(keys.bias(0), bias)
     for i, p in enumerate(measured.parameters):
@@ -113,7 +120,7 @@ def factor_of(measured, first=None):
     rows = sum(b.weight.size for b in measured.bound)
     weight = np.linspace(1.0, 2.0, rows)
     shared = [keys.calibration(i, p.mean.size) for i, p in enumerate(measured.parameters)]
-    return measurement_factor(measured, weight, keys.node(0), keys.bias(0), shared, first)
+    return measurement_factor(measured, weight, NODES, shared, first)
 
 
 def test_the_factor_has_no_error_at_the_truth():
@@ -167,10 +174,9 @@ def test_the_factor_linearises_as_differences_do(claims):
 def test_what_was_computed_elsewhere_is_not_taken():
     """A range is not linear in the position, nor a velocity in the accelerometer's bias."""
     measured, states, values = node_measurements(trial=FREE)
-    residual, jacobian, _ = measured.linearize(states, values)
-    at = gtsam_values(measured, states, values)
-    own = at.atNavState(keys.node(0)), at.atConstantBias(keys.bias(0))
-    computed = Linearized(*own, values, residual + 100.0, jacobian)
+    residual, jacobian, *_ = measured.linearize(states, values)
+    own = states_at(gtsam_values(measured, states, values), NODES)
+    computed = Linearized(own, values, residual + 100.0, jacobian)
 
     def is_taken(states, values):
         factor = factor_of(measured, computed)
@@ -207,23 +213,23 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     gyro = np.tile([0.0, 0.0, 0.1], (time.size, 1))
     trial = simulate(scenario())
     imu = replace(trial.imu, time=time, gyro=gyro, accel=np.tile([0, 0, 9.8], (time.size, 1)))
-    inc, _ = increments(imu, (0, 0))
+    inc, _ = increments(imu, (Smoothing(0), Smoothing(0)))
     chain = chain_of(imu, frame, one_segment(inc, 50, 100), np.array([[0.0, 0.0, -9.8]]))
     estimated = [p for p in dvl.parameters() if p.estimated]
     fixed = {p.name: p.mean for p in dvl.parameters() if not p.estimated}
     mean = {p.name: exp_so3(p.mean) if p.rotation else p.mean for p in dvl.parameters()}
     bound, _ = bind(chain, dvl.observations(frame, "RFU"), estimated, {}, 0.0)
     measured = NodeMeasurements.of(bound, estimated, fixed)
-    rest = np.zeros((1, 3))
-    states = States(np.eye(3)[None], rest, rest, rest, rest)
-    residual, _, _ = measured.linearize(states, mean)
+    rest = np.zeros((2, 3))
+    states = States(exp_so3([[0.0, 0.0, 0.0], [0.0, 0.0, 0.05]]), rest, rest, rest, rest)
+    residual, *_ = measured.linearize(states, mean)
     np.testing.assert_allclose(residual, [-0.2, 0.0, 0.0], atol=1e-9)
 
 
 def test_a_factor_with_the_wrong_number_of_keys_is_refused():
     measured, _, _ = node_measurements(trial=FREE)
     with pytest.raises(ValueError, match="keys"):
-        measurement_factor(measured, np.ones(5), keys.node(0), keys.bias(0), [])
+        measurement_factor(measured, np.ones(5), NODES, [])
 
 
 def public_factor(**changes):
@@ -234,9 +240,11 @@ def public_factor(**changes):
     times = np.arange(18.0, 24.0)
     chain = preintegrate(trial.imu, times, frame, exact_states(scene, frame, times).p_n)
     states = exact_states(scene, frame, chain.time)
-    values, named = gtsam.Values(), {"state": keys.node(2), "bias": keys.bias(0)}
-    nav = gtsam.NavState(gtsam.Rot3(states.nRb[2]), states.p_n[2], states.v_n[2])
-    values.insert(named["state"], nav)
+    values, named = gtsam.Values(), {"bias": keys.bias(0)}
+    for k, name in ((2, "state"), (3, "state_after")):
+        named[name] = keys.node(k)
+        nav = gtsam.NavState(gtsam.Rot3(states.nRb[k]), states.p_n[k], states.v_n[k])
+        values.insert(named[name], nav)
     values.insert(named["bias"], gtsam.imuBias.ConstantBias())
     for i, p in enumerate(trial.dvl.parameters()):
         if not p.estimated:

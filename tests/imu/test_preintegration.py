@@ -15,9 +15,10 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.node_jacobian import node_jacobian
+from factorgraph_dvl.graph.node_jacobian import by_node
+from factorgraph_dvl.imu.gtsam_measurements import gtsam_measurements
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.preintegration import Segments, gtsam_measurements, segments
+from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States, Transition, attach, motion_at, segment_ends
 from factorgraph_dvl.sensors.protocol import Linearization
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -124,10 +125,10 @@ def blocks(transition):
     """Attitude, position, velocity and rate at the times by node and bias, (M, 12, 15)."""
     m = transition.at.node.size
     eye, zero = np.broadcast_to(np.eye(3), (m, 3, 3)), np.zeros((m, 3))
-    parts = [
-        node_jacobian(Linearization(zero, **{name: eye}), transition)
-        for name in ("d_theta", "d_p", "d_v", "d_omega")
-    ]
+    parts = []
+    for name in ("d_theta", "d_p", "d_v", "d_omega"):
+        state, bias = by_node(Linearization(zero, **{name: eye}), transition)
+        parts.append(np.concatenate([*state, *bias], axis=2))
     return np.concatenate(parts, axis=1)
 
 
@@ -250,7 +251,8 @@ def test_strides_lead_where_samples_do(cases, name, samples_of_a_stride, monkeyp
     case = cases[name]
     assert case.seg.stride == samples_of_a_stride
     strides = case.pims()
-    monkeypatch.setattr("factorgraph_dvl.imu.preintegration._FEW", case.seg.increments.dt.size + 1)
+    few = case.seg.increments.dt.size + 1
+    monkeypatch.setattr("factorgraph_dvl.imu.gtsam_measurements._FEW", few)
     samples = case.pims()
     # Far more than is left of a bias: what it does is compared, too.
     bias = gtsam.imuBias.ConstantBias(np.full(3, 1e-2), np.full(3, 1e-5))

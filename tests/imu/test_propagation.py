@@ -12,7 +12,6 @@ from factorgraph_dvl.imu.propagation import (
     attach,
     attach_inside,
     extrapolated,
-    later,
     motion_at,
     segment_ends,
 )
@@ -89,20 +88,6 @@ def test_a_motion_is_extrapolated_with_its_rates():
     np.testing.assert_allclose(found.v_n, two.v_n, atol=0.2 * late.item() ** 2)
     np.testing.assert_allclose(found.p_n, two.p_n, atol=0.2 * late.item() ** 3)
     np.testing.assert_allclose(found.nRb @ exp_so3([0, 0, -0.09]), np.eye(3)[None], atol=1e-9)
-
-
-def test_an_attachment_is_later_with_its_rates():
-    seg = constant_segments(3.0, gyro=(0.0, 0.0, 0.2), accel=(0.0, 1.0, 9.8))
-    late, earth_rate = np.array([0.05]), np.array([0.0, 5e-5, 5e-5])
-    time = seg.node_time[:1] + 0.4
-    found = later(attach(seg, time, earth_rate), late, earth_rate)
-    expected = attach(seg, time + late, earth_rate)
-    for name in ("node", "tau", "dR", "turn", "gyro"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-12)
-    second = 0.2 * late.item() ** 2
-    np.testing.assert_allclose(found.dA, expected.dA, atol=second)
-    np.testing.assert_allclose(found.dV, expected.dV, atol=second)
-    np.testing.assert_allclose(found.dP, expected.dP, atol=second * late.item())
 
 
 def test_times_are_attached_in_parts_as_at_once(monkeypatch):

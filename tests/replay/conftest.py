@@ -29,7 +29,7 @@ class Started:
 
     def segment(self, i: int) -> Segments:
         """Return second i after the start."""
-        inc, _ = increments(self.trial.imu, self.start.windows)
+        inc, _ = increments(self.trial.imu, self.start.smoothing)
         edges = np.searchsorted(inc.start, self.start.time + np.array([i, i + 1.0]) - 1e-6)
         return one_segment(inc, *edges.tolist())
 
@@ -58,7 +58,7 @@ def silent(stage, iteration, cost):
 
 @pytest.fixture(scope="session")
 def started() -> Started:
-    trial = simulate(scenario(noise=True), 2).without_windows()
+    trial = simulate(scenario(noise=True), 2)
     early = before(trial, STARTED)
     start = solve_start(early, None, 1.0, STARTED - 3.0, silent, 0.0)
     assert isinstance(start, ReplayStart), start

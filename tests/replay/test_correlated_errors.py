@@ -84,7 +84,7 @@ def test_an_error_is_interpolated_between_the_states(errors):
         SimpleNamespace(
             observation=o,
             weight=np.ones((len(tau), len(o.components))),
-            attachment=SimpleNamespace(tau=np.array(tau)),
+            attachment=SimpleNamespace(forward=SimpleNamespace(tau=np.array(tau))),
         )
         for o, tau in ((observation, [0.0, 0.15]), (other, [0.1]))
     ]

@@ -112,12 +112,11 @@ def measured(label, time, components, gate=None):
 
 def test_innovations_have_the_spread_of_prediction_and_noise_and_outliers_no_weight():
     rows = (measured("a", [1.0, 2.0], ("x", "y")), measured("b", [1.5], ("z",)))
-    jacobian = np.array([[1.0, 0.0], [0.0, 2.0], [1.0, 0.0], [0.0, 2.0], [1.0, 1.0]])
-    P = np.diag([9.0, 4.0])
+    variance = np.array([9.0, 16.0, 9.0, 16.0, 13.0])
     sigma = np.array([4.0, 3.0, 4.0, np.inf, 1.0])
     residual = np.array([5.0, 10.0, 500.0, 7.0, 0.1])
     weights, innovations, findings = gated(
-        SimpleNamespace(bound=rows), residual, jacobian, sigma, P, InnovationGate()
+        SimpleNamespace(bound=rows), residual, variance, sigma, InnovationGate()
     )
     np.testing.assert_allclose(innovations[0].sigma, [[5.0, 5.0], [5.0, np.nan]])
     np.testing.assert_allclose(innovations[0].residual, [[5.0, 10.0], [500.0, np.nan]])

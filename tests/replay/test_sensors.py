@@ -99,6 +99,26 @@ def test_single_beams():
     as_the_batch(trial)
 
 
+def test_a_dvl_that_averages():
+    """Its pings are compared as means over windows, which reach over states."""
+    swell = [{"amplitude_deg": 4, "frequency_hz": 0.3, "phase_deg": 0}]
+    scene = config(
+        "seed-a-phase-90",
+        manoeuvres=TURNS,
+        sway={"roll": swell, "pitch": swell},
+        dvl={"averaging_s": 0.5},
+        trial={"dvl": {"averaging_s": 0.5}},
+    )
+    trial = simulate(scene, 1)
+    as_the_batch(trial)
+    innovations = []
+    replay(trial, rate_hz=5.0, watch=lambda u: innovations.extend(u.innovations))
+    ratio = np.concatenate(
+        [(i.residual / i.sigma).ravel() for i in innovations if i.label == "DVL velocity"]
+    )
+    assert 0.9 < np.sqrt(np.nanmean(ratio**2)) < 1.1
+
+
 def test_star_vectors_one_epoch_at_a_time():
     trial = simulate(config("seed-a-star", manoeuvres=TURNS), 1)
     (star,) = trial.others

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.graph.priors import prior_mean
-from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind, state_of
+from factorgraph_dvl.graph.sensor_factor import NodeMeasurements, bind, states_of
 from factorgraph_dvl.replay.navigator import LocalGravity
 from factorgraph_dvl.replay.smoother import Smoother
 from factorgraph_dvl.replay.spurious import SpuriousInformation
@@ -22,15 +22,17 @@ def second(started):
     )  # fmt: skip
     values = {**start.fixed, **smoother.calibration()}
     seg = started.segment(0)
-    states = state_of(smoother.state(start.node), smoother.bias(start.node))
-    gravity = LocalGravity(start.frame).at(states.p_n)
+    state, bias = smoother.state(start.node), smoother.bias(start.node)
+    gravity = LocalGravity(start.frame).at(state.position()[None])
     chain = start.chain.following(seg, gravity, start.node)
+    after = chain.graph.at(0).preintegratedMeasurements().predict(state, bias)
+    states = states_of([state, after], [bias])
     observations = [
         o for aid in started.aids(seg) for o in aid.observations(start.frame, start.body_axes)
     ]
     bound, _ = bind(chain, observations, start.parameters, {}, start.clock_zero)
     measured = NodeMeasurements.of(bound, start.parameters, start.fixed)
-    _, _, motions = measured.linearize(states, values)
+    _, _, motions, _ = measured.linearize(states, values)
     P = smoother.joint_covariance()[:9, :9]
     weights = [b.weight for b in measured.bound]
     return measured, motions, weights, values, P

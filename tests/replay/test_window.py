@@ -12,7 +12,8 @@ from truth import CONFIGS
 
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.replay.window import Window, WindowChain
+from factorgraph_dvl.imu.attitude_record import AttitudeRecord
+from factorgraph_dvl.replay.window import BatchSolution, Window, WindowChain
 from factorgraph_dvl.sensors.attitude import AttitudeAngles
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import load_scenario, simulate
@@ -24,6 +25,8 @@ from factorgraph_dvl.solvers.rounds import settle
 from factorgraph_dvl.statistics.square_root_information import eliminated
 
 FIRST = 40
+# What a window takes of noise and strengths is the same through water.
+OVER_GROUND = pytest.mark.parametrize("ship", ["ship"], indirect=True)
 
 
 @pytest.fixture(scope="module", params=["ship", "ship-water"])
@@ -33,12 +36,27 @@ def ship(request):
     return simulate(msgspec.structs.replace(scenario, manoeuvres=legs), 2)
 
 
-@pytest.fixture(scope="module")
-def whole(ship):
-    """All nodes of a batch solution."""
-    prepared = prepare_without_imu(ship)
+def solved(trial, duration):
+    """Return a batch solution, and what windows take from it."""
+    prepared = prepare_without_imu(trial)
     settled = settle(prepared, prepared.states, lambda stage, iteration, cost: None)
-    problem, minimum = settled.problem, settled.minimum
+    return settled, BatchSolution.of(prepared, settled.problem, duration)
+
+
+@pytest.fixture(scope="module")
+def both(ship):
+    return solved(ship, 80.0)
+
+
+@pytest.fixture(scope="module")
+def batch(both):
+    return both[1]
+
+
+@pytest.fixture(scope="module")
+def whole(both):
+    """All nodes of a batch solution."""
+    problem, minimum = both[0].problem, both[0].minimum
     # What the clocks have moved beyond the last node since it was bound.
     beyond = {
         b.observation.label: b.observation.time[
@@ -161,3 +179,37 @@ def test_motion_is_returned_once(whole):
     np.testing.assert_array_equal(np.append(first.time, second.time), every.time)
     assert whole.newest(axes).time[0] == pytest.approx(whole.now)
     assert every.time[-1] <= whole.now
+
+
+@OVER_GROUND
+def test_a_few_rows_have_the_noise_of_the_record(ship, whole, batch):
+    rows = rows_of(ship.attitude, slice(100, 110))
+    (few,) = batch.observations(rows)
+    (every,) = (o for o in whole.problem.observations if o.label == "Attitude")
+    np.testing.assert_allclose(few.std, every.std[100:110])
+    # Stated noise of other sensors may differ from row to row.
+    assert batch.std.keys() == {"Attitude"}
+    assert batch.labels["gnss"] == {"GNSS position"}
+
+
+@OVER_GROUND
+def test_densities_are_those_of_turns_where_the_vessel_turns(ship, batch):
+    record = AttitudeRecord(ship.attitude, ship.body_axes, estimated=False)
+    density = batch.density(record, np.array([20.0, 43.0, 65.0]))
+    # The averages that axes of the track follow reach over the whole of this turn.
+    np.testing.assert_array_equal(density, batch.densities[[0, 2, 2]])
+    assert np.any(batch.densities[0] != batch.densities[2])
+
+
+@OVER_GROUND
+def test_before_the_first_turn_another_strength_is_assumed(ship):
+    _, batch = solved(ship.until(35.0), 35.0)
+    leg, *others = batch.densities
+    for density in others:
+        np.testing.assert_array_equal(density[:3], leg[:3])
+        assert np.all(density[3:] >= 1e-3)
+
+
+@OVER_GROUND
+def test_the_tilt_grows_with_time(whole, batch):
+    np.testing.assert_allclose(80.0 * batch.tilt, whole.problem.tilt.gradient)

@@ -73,6 +73,15 @@ def test_drift_is_no_correlation():
     assert fit_correlation(time, data) is None
 
 
+def test_a_minute_shows_that_noise_persists_but_hardly_for_how_long():
+    """Without an expected time, one that is as long as the record explains it as well."""
+    time = np.arange(225) * 0.2
+    for seed in range(20):
+        found = fit_correlation(time, residuals(time, 0.5, 0.5, 2.0, seed), expected_time_s=2.0)
+        assert 0.5 < found.time_s < 10.0
+        assert found.gain > 20.0
+
+
 def test_gaps_are_left_out():
     time = np.arange(6000) * 0.2
     data = residuals(time, 0.5, 0.5, 2.0)

@@ -19,15 +19,14 @@ from factorgraph_dvl.files.importing.speeds import speed_of
 from factorgraph_dvl.files.importing.time_base import Timed
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, rotate
+from factorgraph_dvl.geometry.vectors import Array, rotate, spread
 from factorgraph_dvl.sensors.dvl import STD_COLUMNS, VELOCITY_COLUMNS
 from factorgraph_dvl.sensors.dvl_beams import beam_columns
 
 # Chosen: the least σ that a log is taken to have, and that of one that says nothing, m/s.
 _LEAST_STD, _USUAL_STD = 0.005, 0.02
-# The standard deviation of normal errors is this times their median magnitude, and one in 1.7
-# million of them is larger than this many of it.
-_MAD, _GROSS = 1.4826, 5.0
+# One in 1.7 million of normal errors is larger than so many standard deviations.
+_GROSS = 5.0
 _CONTRADICTORY = (
     "{}: {} of {} pings with an error velocity above 5 σ, half of them from {:.0f} to {:.0f} s "
     "after the first ping: the beams contradict each other, look for a false bottom lock there"
@@ -230,12 +229,12 @@ def _std(pings: Merged, decisions: Decisions) -> float:
     error = pings.sample["error"][known]
     # The error velocity is scaled so that its σ is that of the horizontal velocities. Where most
     # have one value, as 0, the instrument does not measure it.
-    spread = _MAD * float(np.median(np.abs(error - np.median(error)))) if len(error) else 0.0
-    if spread > 0.0:
-        value = max(_LEAST_STD, round(spread, 4))
+    usual = float(spread(error - np.median(error))) if len(error) else 0.0
+    if usual > 0.0:
+        value = max(_LEAST_STD, round(usual, 4))
         decisions.add(
             label,
-            f"σ of velocities from the spread of the error velocity: {spread:.4f} m/s → {value:g}",
+            f"σ of velocities from the spread of the error velocity: {usual:.4f} m/s → {value:g}",
             "dvl.velocity_std_m_s",
         )
         gross = np.abs(error - np.median(error)) > _GROSS * value
