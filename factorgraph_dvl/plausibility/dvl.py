@@ -13,7 +13,7 @@ from factorgraph_dvl.initialization.dvl_windows import DvlFit
 from factorgraph_dvl.message import Message, either, message
 from factorgraph_dvl.plausibility.axes import in_words, mirrored, swapped
 from factorgraph_dvl.plausibility.gnss import MOVING_M_S, RADIANS, SPEED_UNITS
-from factorgraph_dvl.plausibility.records import WINDOW_S, gnss_velocity
+from factorgraph_dvl.plausibility.records import WINDOW_S, covered, gnss_velocity
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.scale_causes import beam_angles
 from factorgraph_dvl.sensors.beam_geometry import as_dvl, error_velocity
@@ -70,7 +70,7 @@ def _speed_findings(dvl: Dvl, gnss: Gnss) -> Iterator[Finding]:
     if time.size < 2:
         return
     pings = dvl.time[dvl.locked]
-    inside = (pings >= time[0]) & (pings <= time[-1])
+    inside = covered(time, pings, pings)
     at_ping = interpolate(pings[inside], time, velocity)
     gnss_speed = np.linalg.norm(at_ping, axis=1)
     dvl_speed = np.linalg.norm(dvl.velocity[dvl.locked][inside], axis=1)

@@ -10,7 +10,7 @@ from scipy.integrate import cumulative_trapezoid
 from factorgraph_dvl.geometry.units import DEG, KNOT
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.plausibility.records import WINDOW_S, velocity_between_fixes
+from factorgraph_dvl.plausibility.records import WINDOW_S, covered, velocity_between_fixes
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.gnss import Gnss
 
@@ -43,6 +43,10 @@ def gnss_findings(gnss: Gnss) -> Iterator[Finding]:
     if begin.size < 3 or measured.sum() < 3:
         return
     time, velocity = gnss.time[measured], gnss.velocity[measured]
+    common = covered(time, begin, end)
+    if common.sum() < 3:
+        return
+    begin, end, between = begin[common], end[common], between[common]
     mean = _interval_means(time, velocity, begin, end)
     noise = np.sqrt(2.0) * float(np.median(gnss.position_std[:, :2])) / float(
         np.median(end - begin)

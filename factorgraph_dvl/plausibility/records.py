@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.speed_log import SpeedLog
@@ -75,6 +75,24 @@ def record_of(label: str, time: Array, missing: Array) -> SensorSurvey:
         longest_gap=float(gaps.max(initial=0.0)),
         missing=float(np.mean(missing)),
     )
+
+
+def covered(time: Array, begin: Array, end: Array) -> BoolArray:
+    """Whether spans from begin to end (M,), s, are within a record, and none has a gap of it.
+
+    Parameters
+    ----------
+    time : ndarray, shape (N,), s
+        Times of the record.
+    begin, end : ndarray, shape (M,), s
+        Spans; instants where both are the same.
+    """
+    intervals = np.diff(time)
+    gaps = np.append(0, np.cumsum(intervals > GAP_INTERVALS * np.median(intervals)))
+    first = np.searchsorted(time, begin, side="right") - 1
+    last = np.searchsorted(time, end)
+    inside = (first >= 0) & (last < time.size)
+    return np.asarray(inside & (gaps[np.minimum(last, gaps.size - 1)] == gaps[first]))
 
 
 def travel(gnss: Gnss | None, dvl: Dvl | None, log: SpeedLog | None = None) -> tuple[float, Array]:

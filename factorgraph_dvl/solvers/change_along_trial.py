@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,10 +98,14 @@ def component_changes(
     ]
 
 
-def change_findings(found: SolvedProblem, every: Iterable[Rows]) -> Iterator[Finding]:
+def change_findings(
+    found: SolvedProblem, every: Iterable[Rows], limits: Mapping[str, float]
+) -> Iterator[Finding]:
     """Yield a finding where a parameter changes along the trial by more than chance allows.
 
     Of several components the most probable one is named, and those that are about as probable.
+    A change below what is good enough is a drift that the standard deviation lacks, and no reason
+    not to use the mean.
 
     Parameters
     ----------
@@ -109,6 +113,8 @@ def change_findings(found: SolvedProblem, every: Iterable[Rows]) -> Iterator[Fin
         Problem at its minimum, with covariances.
     every : iterable of Rows
         All rows of the graph that is linearised there.
+    limits : mapping of str to float
+        Standard deviations that are good enough, by parameter, in reported units.
     """
     tests = component_changes(
         found.problem, found.minimum.evaluation, found.covariances.information, every
@@ -126,10 +132,11 @@ def change_findings(found: SolvedProblem, every: Iterable[Rows]) -> Iterator[Fin
     others: Message | str = ""
     if ties:
         others = message("changed_along_trial.others", names=[t.name for t in ties])
+    small = abs(change.size) < limits.get(best.parameter.name, 0.0)
     yield Finding(
         Code.CHANGED_ALONG_TRIAL,
         message(
-            "changed_along_trial.changes",
+            "changed_along_trial.drifts" if small else "changed_along_trial.changes",
             name=best.name,
             size=change.size,
             std=change.std,
@@ -139,4 +146,5 @@ def change_findings(found: SolvedProblem, every: Iterable[Rows]) -> Iterator[Fin
             significance=change.significance,
         ),
         parameter=best.parameter.name,
+        severity="warning" if small else "error",
     )

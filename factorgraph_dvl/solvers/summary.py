@@ -70,7 +70,9 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     findings += outlier_findings(residuals, [r for r in rejected if r.reason != "echo"])
     changes: list[Finding] = []
     # The rows, which take longest to make, serve both.
-    error_budget = causes(found, lambda rows: changes.extend(change_findings(found, rows)))
+    error_budget = causes(
+        found, lambda rows: changes.extend(change_findings(found, rows, trial.limits))
+    )
     findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     findings += heading_and_misalignment(trial, found)

@@ -31,6 +31,24 @@ def test_a_speed_ratio_is_not_taken_for_a_scale_error() -> None:
         assert contributor in text
 
 
+def test_speeds_compare_where_there_are_fixes() -> None:
+    """The vehicle goes faster where GNSS is lost."""
+    trial = build_trial()
+    gnss, dvl = trial.gnss, trial.dvl
+    assert gnss is not None
+    assert dvl is not None
+    lost = (gnss.time > 10.0) & (gnss.time < 50.0)
+    inside = (dvl.time > 11.0) & (dvl.time < 49.0)
+    gone = replace(
+        gnss,
+        geodetic=np.where(lost[:, None], np.nan, gnss.geodetic),
+        velocity=np.where(lost[:, None], np.nan, gnss.velocity),
+    )
+    fast = replace(dvl, velocity=dvl.velocity * np.where(inside, 1.5, 1.0)[:, None])
+    assert not survey(replace(trial, gnss=gone, dvl=fast)).errors
+    assert survey(replace(trial, dvl=fast)).errors
+
+
 def test_a_fix_of_the_velocity_alone_is_a_measurement() -> None:
     trial = build_trial()
     nowhere = np.full_like(trial.gnss.geodetic, np.nan)

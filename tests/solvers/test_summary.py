@@ -9,7 +9,12 @@ import pytest
 import solved
 
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.dvl import SCALE_SPEC
+from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solvers import change_along_trial
+from factorgraph_dvl.solvers.change_along_trial import ComponentChange
 from factorgraph_dvl.solvers.summary import summarise
+from factorgraph_dvl.statistics.constancy import Change
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +60,14 @@ def test_what_the_data_do_not_determine_is_named_with_its_reason():
     for component in ("lever_arm_x_m", "lever_arm_z_m", "misalignment_y_deg"):
         assert any(component in text for text in texts), component
     assert solution.verdict.grade == "doubtful"
+
+
+@pytest.mark.parametrize(("size", "grade"), [(-9e-4, "doubtful"), (1.1e-3, "do not use")])
+def test_a_change_below_the_limit_of_its_parameter_is_a_drift(monkeypatch, size, grade):
+    scale = Parameter(SCALE_SPEC, np.zeros(1), np.ones(1))
+    change = ComponentChange(scale.name, scale, Change(40.0, 40.0, 50.0, size, 1e-4))
+    monkeypatch.setattr(change_along_trial, "component_changes", lambda *_: [change])
+    trial, found = solved.turning()
+    verdict = summarise(trial, found, rate_hz=2.0).verdict
+    assert verdict.grade == grade
+    assert [r.code for r in verdict.reasons] == [Code.CHANGED_ALONG_TRIAL]
