@@ -32,13 +32,11 @@ _SHARE = 0.5
 _CERTAIN = 3.0
 
 
-def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, float]:
+def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     """Return the lengths of windows that are taken as known and that the data contradict.
 
-    By name, with what each must take off the objective: a window that leaves most of a misfit is
-    not its cause. The test alone does not tell, as other parameters are far off where there is
-    one. None where another parameter of the sensor that is taken as known, as its clock, explains
-    more.
+    None where another parameter of the sensor that is taken as known, as its clock, explains more,
+    or where the window leaves most of a misfit: then the cause is another one.
 
     Parameters
     ----------
@@ -46,7 +44,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, float]:
         Problem, and its minimum.
     """
     known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.plausible}
-    out: dict[str, float] = {}
+    out = []
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         p = known.get(_length(bound))
         if p is None or not p.spec.usual or not bound.weight.any():
@@ -74,9 +72,10 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, float]:
         found = {k.name: tests.test([k.name]).chi2 for k in own}
         fall = found[p.name]
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        if fall > _SHOWN * scatter and fall == max(found.values()):
-            out[p.name] = _SHARE * _misfit(bound, residual)
-    return out
+        most = max(_SHARE * _misfit(bound, residual), *found.values())
+        if fall > _SHOWN * scatter and fall >= most:
+            out.append(p)
+    return tuple(out)
 
 
 def _misfit(bound: BoundObservation, residual: Array) -> float:

@@ -220,8 +220,7 @@ def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None
         )
         iterations += found.minimum.iterations
         # An objective is that of a minimum: where one was not reached, it is still open.
-        least = at.objective - proposal.least_fall
-        if found.objective < least or (at.rough and proposal.model is at.model):
+        if found.objective < at.objective or (at.rough and proposal.model is at.model):
             return found, iterations
     if not at.model.is_applied(at.problem):
         at.model.applied(at.problem)

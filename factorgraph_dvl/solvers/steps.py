@@ -71,15 +71,12 @@ class Proposal:
         States of the nodes, and values of all parameters.
     rough : bool, default False
         Whether the minimisation may end early, as another one follows.
-    least_fall : float, default 0
-        Fall of the objective below which it is not kept.
     """
 
     model: Model
     states: Any
     values: dict[str, Array]
     rough: bool = False
-    least_fall: float = 0.0
 
 
 class Step(Protocol):
@@ -196,16 +193,15 @@ class Averaging:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the length of a window, where the data show one."""
         model = at.model
-        # Noise that persists is a part of the misfit until it is known.
-        own = model.parameters, _labels(model)
-        if self._tested.before(*own) or at.rough or at.problem.chain.interpolates:
+        if self._tested.before(model.parameters) or at.rough or at.problem.chain.interpolates:
             return
-        self._tested.note(*own)
+        self._tested.note(model.parameters)
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
-        parameters = tuple(wide(p, p.mean) if p.name in found else p for p in model.parameters)
-        yield replace(_from(at, parameters=parameters), least_fall=sum(found.values()))
+        free = {p.name: wide(p, p.mean) for p in found}
+        parameters = tuple(free.get(p.name, p) for p in model.parameters)
+        yield _from(at, parameters=parameters)
 
 
 class GrossErrors:
