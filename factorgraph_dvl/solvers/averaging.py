@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -15,10 +16,8 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.solvers.known_parameters import wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
-from factorgraph_dvl.statistics.scores import scores_at
 
 # χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
 # twenty is beyond, and loses some precision; one that does is left with less than two standard
@@ -26,6 +25,8 @@ from factorgraph_dvl.statistics.scores import scores_at
 _SHOWN = 2.7
 # Measurements that are tested, and in how many stretches. Chosen: a third of a second of work.
 _ENOUGH, _STRETCHES = 5000, 20
+# Relative size of an eigenvalue of information that is none.
+_ROUNDING = 1e-9
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
 # Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
@@ -49,27 +50,10 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         p = known.get(_length(bound))
         if p is None or not p.spec.usual or not bound.weight.any():
             continue
-        some = _some_of(len(residual))
-        window = replace(
-            bound,
-            observation=ObservationRows(bound.observation, some),
-            attachment=None,
-            usable=bound.usable[some],
-            weight=bound.weight[some],
-            averages=True,
-        )
-        own = [known[name] for name in parameters_of(bound.observation) if name in known]
-        tests = scores_at(
-            problem,
-            window,
-            minimum.evaluation,
-            minimum.square_root or factorized(problem, minimum.evaluation)[0],
-            {k.name: wide(k, k.mean).sigma for k in own},
-            share=some.size / len(residual),
-        )
-        if tests.score[tests.places[p.name]][0] <= 0.0:
+        own = [name for name in parameters_of(bound.observation) if name in known]
+        found = _chi_squares(problem, bound, minimum, residual, own)
+        if not found:
             continue
-        found = {k.name: tests.test([k.name]).chi2 for k in own}
         fall = found[p.name]
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
         most = max(_SHARE * _misfit(bound, residual), *found.values())
@@ -123,3 +107,68 @@ def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Find
 def _length(bound: BoundObservation) -> str:
     """Return the name of the length of its window, empty if it has none."""
     return bound.observation.averaging or ""
+
+
+def _chi_squares(
+    problem: Problem,
+    bound: BoundObservation,
+    minimum: Minimum,
+    residual: Array,
+    known: Sequence[str],
+) -> dict[str, float]:
+    """Return twice the fall of the cost by each of some known parameters.
+
+    With J the whitened derivatives by one of them, A those by all variables, P the covariance of
+    these and r the residuals, rᵀJ (JᵀJ - JᵀA P AᵀJ)⁻¹ Jᵀr: the score tests of `statistics.scores`,
+    at the price of no elimination. Nothing where the window should not be longer.
+    """
+    evaluation = minimum.evaluation
+    values, length = evaluation.parameters, _length(bound)
+    some = _some_of(len(residual))
+    window = replace(
+        bound,
+        observation=ObservationRows(bound.observation, some),
+        attachment=None,
+        usable=bound.usable[some],
+        weight=bound.weight[some],
+        averages=True,
+    )
+    window.attach(values)
+    motion = window.motion(window.attachment, evaluation.states, values)
+    own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
+    wanted = [p.name for p in own]
+    lin = window.linearized(motion, values, [*wanted, *known], processes)
+    columns = {name: window.weight[:, :, None] * lin.d_parameters[name] for name in known}
+    by_known = np.concatenate(list(columns.values()), axis=2)
+    score = -np.einsum("mdk,md->k", by_known, residual[some])
+    parts = dict(zip(columns, _parts(columns.values()), strict=True))
+    if score[parts[length]][0] <= 0.0:
+        return {}
+    rows, _ = window.jacobian(
+        lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
+    )
+    keys = window.keys_at(window.nodes(processes), processes, [problem.key(n) for n in wanted])
+    by_variables = np.einsum("mdk,mdn->mkn", by_known, rows)
+    edges = np.cumsum([0, *window.sizes(processes, own)])
+    taken_up: dict[int, Array] = {}
+    for variable, first, last in zip(keys.T, edges, edges[1:], strict=False):
+        different, place = np.unique(variable, return_inverse=True)
+        sums = np.zeros((different.size, by_known.shape[2], last - first))
+        np.add.at(sums, place, by_variables[:, :, first:last])
+        for key, each in zip(different.tolist(), sums, strict=True):
+            taken_up[key] = taken_up.get(key, 0.0) + each
+    information = minimum.square_root or factorized(problem, evaluation)[0]
+    left = np.einsum("mdk,mdl->kl", by_known, by_known) - information.covariance_of([taken_up])
+    # Of all measurements, by those that are tested.
+    share = len(residual) / some.size
+    out = {}
+    for name, part in parts.items():
+        step = np.linalg.lstsq(left[part, part], score[part], rcond=_ROUNDING)[0]
+        out[name] = share * float(score[part] @ step)
+    return out
+
+
+def _parts(columns: Iterable[Array]) -> list[slice]:
+    """Return the places of columns (M, d, n) side by side."""
+    edges = np.cumsum([0, *(column.shape[2] for column in columns)]).tolist()
+    return [slice(a, b) for a, b in pairwise(edges)]

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.bound_observation import BoundObservation
-from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 
@@ -130,64 +126,4 @@ def scores(
         whole @ (step / sigma) / sigma,
         (whole - np.eye(sigma.size)) / np.outer(sigma, sigma),
         sigma,
-    )
-
-
-def scores_at(
-    problem: Problem,
-    bound: BoundObservation,
-    evaluation: Evaluation,
-    information: SquareRootInformation,
-    candidates: Mapping[str, Array],
-    share: float = 1.0,
-) -> Scores:
-    """Return scores and information of parameters of one observation, at a minimum without them.
-
-    With J the whitened derivatives by the candidates, A those by all variables, P the covariance
-    of these and r the residuals,
-
-        S = -Jᵀ r,    I = JᵀJ - JᵀA P AᵀJ:
-
-    at the price of no elimination.
-
-    Parameters
-    ----------
-    problem : Problem
-        Problem without the candidates.
-    bound : BoundObservation
-        The observation, or some of its measurements, weighed.
-    evaluation : Evaluation
-        The minimum.
-    information : SquareRootInformation
-        Information on all variables there.
-    candidates : mapping of str to ndarray
-        Standard deviations (n,) of wide priors, SI, by name.
-    share : float, default 1
-        Share of the measurements that these are.
-    """
-    values = evaluation.parameters
-    bound.attach(values)
-    motion = bound.motion(bound.attachment, evaluation.states, values)
-    own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
-    wanted = [p.name for p in own]
-    lin = bound.linearized(motion, values, [*wanted, *candidates], processes)
-    rows, residual = bound.jacobian(
-        lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
-    )
-    columns = [bound.weight[:, :, None] * lin.d_parameters[name] for name in candidates]
-    by_candidates = np.concatenate(columns, axis=2)
-    keys = bound.keys_at(bound.nodes(processes), processes, [problem.key(n) for n in wanted])
-    sums: dict[int, Array] = {}
-    sizes = tuple(bound.sizes(processes, own))
-    o = bound.observation
-    parts = Rows(o.label, o.components, keys, sizes, rows, residual)
-    add_transposed_product(parts, by_candidates, sums)
-    left = np.einsum("mdk,mdl->kl", by_candidates, by_candidates)
-    left -= information.covariance_of([sums])
-    edges = np.cumsum([0, *(column.shape[2] for column in columns)]).tolist()
-    return Scores(
-        {name: slice(*ends) for name, ends in zip(candidates, pairwise(edges), strict=True)},
-        -np.einsum("mdk,md->k", by_candidates, residual) / share,
-        left / share,
-        np.concatenate(list(candidates.values())),
     )
