@@ -21,10 +21,11 @@ from factorgraph_dvl.sensors.protocol import Aid, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
+from factorgraph_dvl.sensors.usbl import Usbl
 
 AIDS: tuple[type[Aid], ...] = (
     *(Gnss, Dvl, Ins, Attitude, Heading, SpeedLog, Star, Depth),
-    *(DvlBeams, Turntable, Beacons),
+    *(DvlBeams, Turntable, Beacons, Usbl),
 )
 
 
