@@ -21,7 +21,7 @@ def test_noise_falls_as_the_weights_say():
     h = 5
     weight = 3.0 * (3 * h**2 + 3 * h - 1) / ((2 * h - 1) * (2 * h + 1) * (2 * h + 3))
     left = local_cubics(noise, 2 * h + 1)
-    assert np.var(left) == pytest.approx(weight, rel=0.03)
+    assert np.var(left) == pytest.approx(weight, rel=0.06)
 
 
 def test_records_are_smoothed_over_less_than_waves_and_never_across_gaps():
