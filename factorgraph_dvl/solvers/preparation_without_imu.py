@@ -42,7 +42,7 @@ from factorgraph_dvl.trial import Trial
 
 CURRENT = "current"
 # Sensors that ask more of the motion than a motion prior gives.
-_NEED_IMU = frozenset({"star", "turntable", "beacons"})
+_NEED_IMU = frozenset({"star", "turntable"})
 # Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
 _TURNING = 0.4 * DEG
 TURN_SPAN = 10.0
