@@ -29,12 +29,12 @@ _ROUNDS = 10
 # Range, m, beyond which no system hears a reply.
 _FARTHEST = 1.2e4
 # What a range is multiplied by where it was recorded as a time, one way or both, by 1500 m/s.
-_TIMES = {
-    "range_s": 1500.0,
-    "range_two_way_s": 750.0,
-    "range_ms": 1.5,
-    "range_two_way_ms": 0.75,
-}
+_TIMES = (
+    (message("usbl_track.range_s"), 1500.0),
+    (message("usbl_track.range_two_way_s"), 750.0),
+    (message("usbl_track.range_ms"), 1.5),
+    (message("usbl_track.range_two_way_ms"), 0.75),
+)
 
 
 def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
@@ -87,9 +87,9 @@ def _candidates(usbl: Usbl) -> Iterator[tuple[Message, Usbl]]:
     north = replace(ship, rph=ship.rph * [1.0, 1.0, 0.0])
     yield message("usbl_track.from_north"), replace(usbl, ship=north)
     farthest = float(np.nanmax(np.linalg.norm(raw, axis=1)))
-    for name, factor in _TIMES.items():
+    for text, factor in _TIMES:
         if factor * farthest < _FARTHEST:
-            yield message(f"usbl_track.{name}"), seen(raw * factor)
+            yield text, seen(raw * factor)
 
 
 def _misfit(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import format_samples as samples
+import format_writers as writers
 import numpy as np
 import pytest
 
@@ -78,26 +79,19 @@ def test_the_vessel_is_not_known_in_a_gap(tmp_path):
     assert np.isfinite(lat[~inside]).all()
 
 
-def sentence(body):
-    check = 0
-    for byte in body.encode():
-        check ^= byte
-    return f"${body}*{check:02X}\r\n".encode()
-
-
 def test_sentences_of_a_usbl_beside_those_of_the_ship(tmp_path):
     """10 m ahead and 5 m to starboard of a ship with the bow to the east; another transponder."""
     lines = []
     for k in range(20):
         at = f"1200{k:02d}.00"
         lines += [
-            sentence(f"GPZDA,{at},01,06,2023,00,00"),
-            sentence(f"GPGGA,{at},5400.0000,N,00300.0000,W,4,12,0.6,10.0,M,50.0,M,,"),
-            sentence("HEHDT,90.0,T"),
-            sentence(f"PSIMSSB,{at},B01,A,,C,H,M,5.0,10.0,30.0,1.5,N,,"),
+            writers.nmea(f"GPZDA,{at},01,06,2023,00,00"),
+            writers.nmea(f"GPGGA,{at},5400.0000,N,00300.0000,W,4,12,0.6,10.0,M,50.0,M,,"),
+            writers.nmea("HEHDT,90.0,T"),
+            writers.nmea(f"PSIMSSB,{at},B01,A,,C,H,M,5.0,10.0,30.0,1.5,N,,"),
         ]
         if k % 4 == 0:
-            lines.append(sentence(f"PSIMSSB,{at},B02,A,,C,H,M,50.0,-10.0,60.0,1.5,N,,"))
+            lines.append(writers.nmea(f"PSIMSSB,{at},B02,A,,C,H,M,50.0,-10.0,60.0,1.5,N,,"))
     (tmp_path / "ship.log").write_bytes(b"".join(lines))
     decisions = import_files([tmp_path / "ship.log"], tmp_path / "trial")
     path = tmp_path / "trial" / "usbl.parquet"
@@ -117,7 +111,7 @@ def test_positions_by_the_example_of_the_document(tmp_path):
         "PTSAG,#16069,124545.449,18,12,2017,1,4305.25355,N,00631.76852,E,F,1013.10,1,9999.00",
         "PTSAG,#16071,124546.173,18,12,2017,0,4305.25123,N,00631.79102,E,F,0002.89,1,9999.00",
     ]
-    (tmp_path / "gaps.txt").write_bytes(b"".join(map(sentence, lines)))
+    (tmp_path / "gaps.txt").write_bytes(b"".join(map(writers.nmea, lines)))
     import_files([tmp_path / "gaps.txt"], tmp_path / "trial")
     names = ("lat_deg", "lon_deg", "height_m")
     lat, lon, height = columns(tmp_path / "trial" / "usbl.parquet", *names)
