@@ -9,6 +9,7 @@ import pytest
 from jacobians import check_jacobians, random_motion
 from truth import exact_motion, scenario
 
+import factorgraph_dvl as fd
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.files.trial_folder import load_trial, record_files, save_trial
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -195,3 +196,9 @@ def test_noise_of_positions_grows_with_the_slant_range():
 def test_settings_are_checked():
     with pytest.raises(ConfigError, match="range_std_m"):
         convert({"range_std_m": 0}, UsblSettings, "usbl", "test")
+
+
+@pytest.mark.parametrize("measures", ["polar", "cartesian", "position"])
+def test_it_passes_the_check_of_sensors(measures):
+    trial = simulate(scenario(usbl=usbl(measures=measures)))
+    fd.check_sensor(trial.find(Usbl), trial.frame(), trial.body_axes)
