@@ -21,9 +21,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc, FancyArrowPatch, Polygon
 
-from factorgraph_dvl import load_trial
+from factorgraph_dvl import load_scenario, load_trial, predict
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.sensors.usbl import Usbl
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
@@ -155,6 +156,44 @@ def run() -> Figure:
     return figure
 
 
+def box_in() -> Figure:
+    """Draw the tracks of the plan `box-in` from above, and what it gives after each minute."""
+    plan = predict(load_scenario(ROOT / "configs" / "plans" / "box-in.yaml"))
+    trial = plan.trial
+    usbl = trial.required(Usbl)
+    assert usbl.ship is not None
+    assert trial.reference is not None
+    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    above, gained = figure.subplots(1, 2)
+    frame = trial.frame()
+    for place, colour, name in (
+        (usbl.ship.geodetic, BODY, "ship, sails a box"),
+        (trial.reference.geodetic, DVL, "vehicle, at 25 and 40 m"),
+    ):
+        east, north, _ = frame.position(*place.T).T
+        above.plot(east, north, color=colour, lw=1.6, label=name)
+        above.plot(east[0], north[0], "^", color=colour)
+    above.set(xlabel="east, m", ylabel="north, m", aspect="equal", title="from above")
+    above.grid(alpha=0.3)
+    above.margins(y=0.2)
+    above.legend(frameon=False, loc="upper left", fontsize=9)
+    minutes = plan.history.time / 60.0
+    for name, colour, text in (
+        ("misalignment_z_deg", DVL, "DVL misalignment z"),
+        ("misalignment_y_deg", ANTENNA, "DVL misalignment y"),
+        ("usbl_misalignment_z_deg", BODY, "USBL misalignment z"),
+    ):
+        gained.semilogy(
+            minutes, plan.history.std[:, plan.history.names.index(name)], color=colour, label=text
+        )
+    gained.axhline(0.1, color=NAVIGATION, lw=0.8, ls=":")
+    gained.set(xlabel="minutes", ylabel="σ, deg", title="what so many minutes give")
+    gained.set(xlim=(0.0, minutes[-1]), ylim=(0.005, 3.0))
+    gained.grid(alpha=0.3, which="both")
+    gained.legend(frameon=False, fontsize=9)
+    return figure
+
+
 def screenshot(page: Path, name: str, language: str) -> None:
     """Write the head of a report as a picture, in `en` or `zh`."""
     chromium = shutil.which("chromium")
@@ -191,7 +230,7 @@ def reports() -> None:
 def main() -> None:
     """Draw all pictures."""
     mpl.rcParams |= {"svg.hashsalt": "factorgraph-dvl", "font.size": 10}
-    for name, figure in (("frames", frames()), ("run", run())):
+    for name, figure in (("frames", frames()), ("run", run()), ("box-in", box_in())):
         figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
     if "--reports" in sys.argv:
         reports()

@@ -30,9 +30,10 @@ from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import JointPrior
 from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
-from factorgraph_dvl.sensors.records import rows_of
+from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
+from factorgraph_dvl.sensors.usbl import Usbl
 
 _Sensor = TypeVar("_Sensor", bound=Aid)
 _Record = TypeVar("_Record", bound=Aid | Imu)
@@ -358,9 +359,32 @@ class Trial:
         return self.find(Attitude) or self.find(Ins)
 
     @property
+    def positioning(self) -> Gnss | Usbl | Ins | None:
+        """The sensor whose positions the trial starts from: GNSS, else the USBL, else the INS."""
+        return self.gnss or self.find(Usbl) or self.find(Ins)
+
+    @cached_property
+    def fixes(self) -> Gnss | None:
+        """Positions to start from: those of GNSS, and of a USBL as its mounting is stated.
+
+        Beside an antenna, a transponder is where that is, within their distance.
+        """
+        usbl = self.find(Usbl)
+        under = None if usbl is None else usbl.fixes(self.frame(), self.body_axes)
+        if self.gnss is None or under is None:
+            return self.gnss or under
+        apart = np.subtract(under.settings.lever_arm_m, self.gnss.settings.lever_arm_m)
+        std = np.hypot(under.position_std, np.linalg.norm(apart))
+        return joined((self.gnss, replace(under, position_std=std)))
+
+    @property
     def position_sensor(self) -> Gnss | Ins | None:
-        """GNSS, or else the INS; None where the trial has neither."""
-        return self.gnss or self.find(Ins)
+        """GNSS and USBL, or else the INS; None where the trial has none of them."""
+        return self.fixes or self.find(Ins)
+
+    def with_fixes(self) -> Trial:
+        """Return the trial with the positions of a USBL as if GNSS had measured them."""
+        return self if self.fixes is self.gnss else replace(self, gnss=self.fixes)
 
     @property
     def body_sensor(self) -> Imu | Attitude | Ins | Heading:
@@ -384,7 +408,7 @@ class Trial:
         Raises
         ------
         DataError
-            If neither GNSS nor `initial.position` nor a beacon gives a position.
+            If neither GNSS nor `initial.position` nor a USBL nor a beacon gives a position.
         """
         known = np.empty((0, 3))
         if self.planar and self.beacons is not None:
@@ -394,7 +418,9 @@ class Trial:
             known = self.initial_position.geodetic[None]
         elif self.gnss is not None:
             known = self.gnss.geodetic[~np.isnan(self.gnss.geodetic[:, 0])]
-        ins = self.find(Ins)
+        usbl, ins = self.find(Usbl), self.find(Ins)
+        if not known.size and usbl is not None:
+            known = usbl.place()[None]
         if not known.size and ins is not None:
             known = ins.geodetic[np.logical_not(ins.missing)]
         if not known.size and self.beacons is not None:
@@ -405,5 +431,5 @@ class Trial:
         raise DataError(
             NO_POSITION,
             where="trial.yaml",
-            expected="a gnss or ins section with positions, initial.position, or beacons",
+            expected="a gnss, usbl or ins section with positions, initial.position, or beacons",
         )

@@ -132,6 +132,7 @@ def own_files():
         "underwater-gps": [
             data for name, data in samples.underwater_gps(60).items() if name != "orientation"
         ],
+        "usbl-sentences": [samples.usbl_sentences()],
         "pixse": [samples.PIXSE * 40],
         "pd0": [made, *map(head, recordings)],
         "ad2cp": [own, echo],

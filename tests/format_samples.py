@@ -149,6 +149,20 @@ def underwater_gps(count=40, start=1_700_000_000.0, heading=90.0):
     return {name: text.encode() for name, text in out.items()}
 
 
+def usbl_sentences(count=40):
+    """Return fixes of two transponders by `$PSIMSSB`, and of another one by `$PTSAG`."""
+    lines = []
+    for k in range(count):
+        at = f"1200{k % 60:02d}.00"
+        lines += [
+            writers.nmea(f"PSIMSSB,{at},B0{1 + k % 2},A,,C,H,M,5.0,{10.0 + k},30.0,1.5,N,,"),
+            writers.nmea(
+                f"PTSAG,#{k:05d},{at},01,06,2023,1,5400.00{k:02d},N,00300.00,W,F,30.1,1,"
+            ),
+        ]
+    return b"".join(lines)
+
+
 def stamped_lines(count=40, start=300.0):
     """Return lines of PD6 as a logger stamps them: 57 of 60 whole, as on a bad cable."""
     out = "Timestamp(s),SensorID,RawLine,CmdOrNote\n"

@@ -177,7 +177,7 @@ def test_simulation_takes_no_measurement_model_from_the_sensors():
         "Sigma3",
         "Vector3",
     }
-    plain |= {"Depth", "DepthSettings"}
+    plain |= {"Depth", "DepthSettings", "Ship", "ShipSettings"}
     for parts in MODULES:
         if parts[0] == "simulation":
             for name in imported(read(parts)):

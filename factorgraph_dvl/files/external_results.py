@@ -32,7 +32,7 @@ from factorgraph_dvl.files.solution_folder import TRAJECTORY_FILE, load_solution
 from factorgraph_dvl.files.trial_folder import TRUTH_FILE, load_reference
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.sensors.beacon import ANY_BEACON, offset_name
+from factorgraph_dvl.sensors.beacon import ANY_BEACON
 from factorgraph_dvl.sensors.catalogue import BEACON_OFFSET, every_spec, specs_of
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION, direction_spec
 from factorgraph_dvl.sensors.records import check_finite, check_range
@@ -124,7 +124,7 @@ class _File(_Parameters, frozen=True, kw_only=True):
 
 def _file_type(text: str) -> type[_File]:
     """Return the type of a file that may contain all parameters, and those of its beacons."""
-    names = [name for name in _KNOWN if name != offset_name(ANY_BEACON)]
+    names = [name for name in _KNOWN if ANY_BEACON not in name]
     names += sorted({m[0] for m in BEACON_OFFSET.finditer(text)})
     fields: list[Any] = [(name, _Given, UNSET) for name in names]
     fields.append((DIRECTION, _Directions | UnsetType, UNSET))

@@ -44,7 +44,13 @@ from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.imu import Imu
-from factorgraph_dvl.sensors.protocol import Aid, SensorRecord, SensorSection
+from factorgraph_dvl.sensors.protocol import (
+    Aid,
+    SensorRecord,
+    SensorSection,
+    part_types,
+    parts_of,
+)
 from factorgraph_dvl.sensors.records import check_possible
 from factorgraph_dvl.settings.certificate import CertificateSettings
 from factorgraph_dvl.settings.convert import from_plain
@@ -58,7 +64,8 @@ TRUTH_FILE = "truth.json"
 # Where a trial that was loaded with a calibration of its DVL or its IMU keeps it when it is saved.
 PRIOR_FILE = "dvl-calibration.json"
 BIAS_FILE = "imu-calibration.json"
-_TABLES = dict.fromkeys(("imu", *(kind.section for kind in AIDS), "reference"))
+_PARTS = tuple(part.section for kind in AIDS for part in part_types(kind).values())
+_TABLES = dict.fromkeys(("imu", *(kind.section for kind in AIDS), *_PARTS, "reference"))
 OWNED = (
     SETTINGS_FILE,
     TRUTH_FILE,
@@ -202,8 +209,13 @@ def record_files(path: Path) -> list[Path]:
     """
     folder, file = locate(path)
     settings = parse_trial(read_text(file), file.name)
-    sections = [] if settings.imu is UNSET else [settings.imu]
-    return [folder / section.file for section in (*sections, *settings.aids.values())]
+    sections: list[SensorSection] = [] if settings.imu is UNSET else [settings.imu]
+    sections += settings.aids.values()
+    for kind in aid_types():
+        if (section := settings.aids.get(kind.section)) is not None:
+            inner = (getattr(section, name) for name in part_types(kind))
+            sections += [part for part in inner if part is not UNSET]
+    return [folder / section.file for section in sections]
 
 
 def save_trial(
@@ -252,7 +264,8 @@ def save_trial(
     owned = tuple(dict.fromkeys((*OWNED, *tables)))
     with new_folder(Path(path), force=force, owned=owned) as folder:
         for record in trial.records:
-            write_table(folder / f"{record.section}{suffix}", record.columns())
+            for each in (record, *parts_of(record).values()):
+                write_table(folder / f"{each.section}{suffix}", each.columns())
         if trial.reference is not None:
             write_table(folder / f"reference{suffix}", motion_columns(trial.reference))
         if trial.calibration_truth:
@@ -390,7 +403,12 @@ def read_record(
     columns, found = without_invalid_values(kind.section, table, settings.file)
     notes += found
     check_possible(columns, settings.file)
-    return kind.from_columns(settings, columns, settings.file)
+    inner = {
+        name: read_record(tables, part, section, notes)
+        for name, part in part_types(kind).items()
+        if (section := getattr(settings, name)) is not UNSET
+    }
+    return cast(Any, kind).from_columns(settings, columns, settings.file, **inner)
 
 
 def _settings(trial: Trial, suffix: str) -> TrialSettings:
@@ -400,12 +418,7 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
         body_axes=trial.body_axes,
         epoch=trial.epoch,
         noise=UNSET if trial.planar else trial.noise,
-        **{
-            record.section: msgspec.structs.replace(
-                record.settings, file=f"{record.section}{suffix}"
-            )
-            for record in trial.records
-        },
+        **{record.section: _named_settings(record, suffix) for record in trial.records},
         limits=_limits(trial),
         certificate=(
             from_plain(dict(trial.certificate), CertificateSettings)
@@ -417,6 +430,12 @@ def _settings(trial: Trial, suffix: str) -> TrialSettings:
             UNSET if trial.reference is None else ReferenceSettings(file=f"reference{suffix}")
         ),
     )
+
+
+def _named_settings(record: SensorRecord, suffix: str) -> SensorSection:
+    """Return the settings of a record and its parts, with the tables as they are written."""
+    inner = {name: _named_settings(part, suffix) for name, part in parts_of(record).items()}
+    return msgspec.structs.replace(record.settings, file=f"{record.section}{suffix}", **inner)
 
 
 def _certificate(trial: Trial) -> CertificateSettings | msgspec.UnsetType:

@@ -9,6 +9,8 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.files.tables import Tables
 from factorgraph_dvl.files.trial_folder import assembled
 from factorgraph_dvl.files.trial_yaml import settings_type
+from factorgraph_dvl.sensors.catalogue import aid_types
+from factorgraph_dvl.sensors.protocol import part_types
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.trial import Trial
 
@@ -52,7 +54,8 @@ def trial_from_tables(
     >>> trial.imu.time.size, trial.dvl.time.size, trial.gnss
     (500, 25, None)
     """
-    sections = {name: dict(settings.pop(name, {})) for name in tables}
+    parts = {name for kind in aid_types() for name in part_types(kind)}
+    sections = {name: dict(settings.pop(name, {})) for name in tables if name not in parts}
     for name, section in sections.items():
         section["file"] = f"table {name}"
     for name, value in settings.items():

@@ -123,7 +123,8 @@ def linearized(
     since = (observation.time - zero)[:, None, None]
     for name, by in zip(own, (-by_time, -by_time * since), strict=False):
         if name in wanted:
-            found[name] = by
+            # A measurement from another vessel knows itself how that one moves.
+            found[name] = found.get(name, 0.0) + by
     for of_chain, by in ((clock, moving), (attitude_clock or clock, turning)):
         if of_chain is not None and of_chain in wanted:
             found[of_chain] = found.get(of_chain, 0.0) + by

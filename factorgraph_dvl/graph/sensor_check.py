@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, wrapped
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import prior_mean
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
+from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation, parts_of
 
 # Steps of the differences: rad, m, m/s, rad/s, and SI units of a parameter. Chosen: rounding of
 # positions on the ellipsoid and curvature are both below the tolerance.
@@ -56,7 +57,9 @@ def check_sensor(sensor: Aid, frame: LocalFrame, body_axes: BodyAxes) -> None:
     _require(sensor, Aid, name)
     table = sensor.columns()
     _check_names(sensor.required, table, f"{name}.columns()", "every required column")
-    again = type(sensor).from_columns(sensor.settings, _with_absent(sensor, table), "columns()")
+    kind: Any = type(sensor)
+    columns = _with_absent(sensor, table)
+    again = kind.from_columns(sensor.settings, columns, "columns()", **parts_of(sensor))
     if not np.array_equal(again.time, sensor.time):
         raise DataError(
             "the times differ after columns() and from_columns()", where=name, expected="the same"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,18 +11,17 @@ from scipy.interpolate import CubicSpline
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.local_cubics import smoothed_arcs, wave_width
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.imu.attitude_history import Orientation
-from factorgraph_dvl.imu.interpolation import ORDER, local_cubics, slope_gain, white_gain
+from factorgraph_dvl.imu.interpolation import slope_gain, white_gain
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import at_row, white_noise
 
 # Standard deviation of a spline's slope at its knots for white noise of 1 in knots 1 s apart.
 _SLOPE = 1.22
-# Span, s, of a local cubic. Chosen: waves that move a ship are longer.
-_SMOOTHED = 1.5
 # Sample intervals, and s, that make a gap, in which attitude is not known. Chosen: a cubic through
 # longer ones is a guess.
 _GAP_INTERVALS = 3.5
@@ -103,8 +101,8 @@ class AttitudeRecord:
             )
         self.interval = float(np.median(np.diff(self.time)))
         noise = white_noise(rph)
-        width = _width(self.interval)
-        smooth = _smoothed(self.time, rph, width, 1.5 * self.interval)
+        width = wave_width(self.interval)
+        smooth = smoothed_arcs(self.time, rph, width, 1.5 * self.interval)
         self._spline = CubicSpline(self.time, smooth)
         self._rate, self._change = self._spline.derivative(), self._spline.derivative(2)
         stated = sensor.error.white
@@ -179,24 +177,3 @@ def level_axes(frame: LocalFrame, p_n: Array) -> Array:
 def longest_gap(time: Array) -> float:
     """Return the gap, s, between records at (M,) beyond which nothing is known between them."""
     return max(_GAP_INTERVALS * float(np.median(np.diff(time))), _LEAST_GAP)
-
-
-def _width(interval: float) -> int:
-    """Return the samples, an odd number, over which a record is smoothed; 0 = it is not."""
-    width = 2 * int(0.5 * _SMOOTHED / interval) + 1
-    return width if width > ORDER + 1 else 0
-
-
-def _smoothed(time: Array, rph: Array, width: int, gap: float) -> Array:
-    """Return angles (M, 3) with local cubics in place of samples, apart for each arc.
-
-    A spline through white noise has slopes that follow it: a clock that moves would climb them.
-    """
-    out = rph.copy()
-    if not width:
-        return out
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > gap) + 1, [time.size]])
-    for a, b in itertools.pairwise(edges.tolist()):
-        if b - a >= width:
-            out[a:b] = local_cubics(rph[a:b], width)
-    return out

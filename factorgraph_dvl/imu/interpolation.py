@@ -15,10 +15,10 @@ from math import factorial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial.polynomial import polyder, polyval, polyvander
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import correlate1d
 
+from factorgraph_dvl.geometry.local_cubics import SHORT, filter_matrix, filtered, polynomial
 from factorgraph_dvl.geometry.vectors import Array
 
 # Half-widths that are tried, samples, the longest of them, s, and the order of the polynomials in
@@ -26,8 +26,6 @@ from factorgraph_dvl.geometry.vectors import Array
 # long.
 _HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
 _LONGEST = 0.25
-# Degree of the local polynomials. Chosen: follows a slope and its change.
-ORDER = 3
 # The narrowest window.
 _NARROW = 2 * _HALF_WIDTHS[0] + 1
 # Measurements over which an error by sway adds up, while noise averages out, and samples of a
@@ -52,9 +50,6 @@ _SURE = 5.0
 _ENOUGH = 60_000
 # Noise of a derivative between single samples, in units of sample noise over interval.
 _RAW_SLOPE = 2.0
-# Signals up to this length, samples, are smoothed by matrices that are kept: a replay smooths a
-# second at a time, and SciPy's filters take more time to begin than to filter so few.
-_SHORT = 300
 # Samples that are smoothed at once, and others on both sides of them beside those of the window.
 # Chosen: some ten megabytes; on a spline, what is so many samples off has a share below 1e-28.
 _AT_ONCE = 50_000
@@ -134,14 +129,14 @@ def best_smoothing(values: Array, dt: float, sigma: float) -> Smoothing:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
             break
-        weights = _polynomial(window)[0]
+        weights = polynomial(window)[0]
         kept = float(weights @ weights)
-        moved = np.mean((_filtered(motion, window) - motion) ** 2, axis=1)
+        moved = np.mean((filtered(motion, window) - motion) ** 2, axis=1)
         by_noise = sigma**2 * (1.0 - 2.0 * weights[half] + kept)
         by_motion = max(float(np.mean(moved)) - by_noise, 0.0)
         chance = 1.25 * by_noise * np.sqrt(2.0 * window / few.size)
         by_sway = max(float(np.median(_means(moved, _BLOCK))) - by_noise - chance, 0.0)
-        left = 0.0 if vibration is None else _power(_filtered(vibration, window), dt)
+        left = 0.0 if vibration is None else _power(filtered(vibration, window), dt)
         goes_on = (_REPEATED - 1.0) * by_sway + _REPEATED * left
         error = by_motion + goes_on + sigma**2 * kept
         if error < best:
@@ -219,7 +214,7 @@ def smooth(
     # Vibration is no step: if a measurement follows it, its residuals show that.
     least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(by.vibration)))
     misfit: Array | None
-    if values.shape[0] > _SHORT:
+    if values.shape[0] > SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
     else:
         to_spline, to_misfit = _short_matrices(values.shape[0], width, averaged)
@@ -266,11 +261,11 @@ def _from(least: float, misfit: Array) -> Array:
 
 def _found_and_misfit(values: Array, width: int, averaged: bool) -> tuple[Array, Array]:
     """Return a smoothed signal (N, 3), and by how much a narrow window differs from it."""
-    found = _filtered(values, width)
+    found = filtered(values, width)
     if averaged:
         # The mean over an interval exceeds the value at its middle by a'' dt² / 24.
-        found -= _filtered(values, width, deriv=2) / 24.0
-    misfit = _filtered(values, _NARROW)
+        found -= filtered(values, width, deriv=2) / 24.0
+    misfit = filtered(values, _NARROW)
     misfit -= found
     return found, misfit
 
@@ -288,7 +283,7 @@ def white_gain(width: int, deriv: int = 0) -> float:
 
     In its middle value, or in a derivative there, at unit intervals.
     """
-    return float(np.linalg.norm(_polynomial(width)[deriv]) * factorial(deriv))
+    return float(np.linalg.norm(polynomial(width)[deriv]) * factorial(deriv))
 
 
 @lru_cache(maxsize=64)
@@ -300,52 +295,13 @@ def slope_gain(width: int) -> float:
     """
     count = 2 * width + 1
     knots, matrix = _spline_matrix(count, 3)
-    spline = BSpline(knots, matrix @ _filter_matrix(count, width), 3)
+    spline = BSpline(knots, matrix @ filter_matrix(count, width), 3)
     return float(np.linalg.norm(spline(width + 0.25, 1)))
-
-
-def local_cubics(values: Array, width: int) -> Array:
-    """Return the values (N, 3) of local cubics."""
-    if values.shape[0] > _SHORT:
-        return _filtered(values, width)
-    return np.asarray(_filter_matrix(values.shape[0], width) @ values)
-
-
-@lru_cache(maxsize=64)
-def _filter_matrix(count: int, width: int) -> Array:
-    return _filtered(np.eye(count), width)
-
-
-def _filtered(values: Array, width: int, deriv: int = 0) -> Array:
-    """Return the filter of Savitzky and Golay; the first and last window serve their ends.
-
-    As `scipy.signal` has it, which takes half as long to load as a short trial to solve.
-    """
-    half = width // 2
-    fit = _polynomial(width)
-    out = correlate1d(values, fit[deriv] * factorial(deriv), axis=0, mode="nearest")
-    place = np.arange(-half, 0.0)
-    for ends, at, rows in (
-        (values[:width], place, slice(half)),
-        (values[-width:], -place[::-1], slice(-half, None)),
-    ):
-        out[rows] = polyval(at, polyder(fit @ ends, deriv)).T
-    return np.asarray(out)
-
-
-@lru_cache(maxsize=64)
-def _polynomial(width: int) -> Array:
-    """Return what takes samples (width, ...) to coefficients of their polynomial, lowest first.
-
-    Places are counted from the middle.
-    """
-    half = width // 2
-    return np.asarray(np.linalg.pinv(polyvander(np.arange(-half, half + 1.0), ORDER)))
 
 
 def _broken_line(time: Array, values: Array) -> BSpline:
     """Return lines between values (N, 3) at regular times, most of which are zero."""
-    if time.size <= _SHORT:
+    if time.size <= SHORT:
         return _short_spline(time, values, 1)
     # Lines that start and end at zero need no knots in between.
     beside = np.pad(values.any(axis=1), 1)

@@ -18,6 +18,7 @@ from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid, Motion
+from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.trial import Trial
 
 # So long before and after a fix, s, the motion without the DVL is good enough to find its
@@ -29,7 +30,7 @@ def mounted_aids(trial: Trial, mountings: dict[str, Array]) -> list[Aid] | None:
     """Return the sensors that the motion can be estimated with before the others are mounted.
 
     None where no such motion is needed, because the DVL is calibrated, or not to be had,
-    because there is no GNSS.
+    because there are no positions.
 
     Parameters
     ----------
@@ -38,14 +39,16 @@ def mounted_aids(trial: Trial, mountings: dict[str, Array]) -> list[Aid] | None:
     mountings : dict of str to ndarray
         Mountings that are known already, by parameter name.
     """
-    if trial.gnss is None or (trial.dvl is not None and _is_calibrated(trial.dvl)):
+    if trial.fixes is None or (trial.dvl is not None and _is_calibrated(trial.dvl)):
         return None
     return [
         aid
         for aid in trial.aids
         if aid is not trial.dvl
         and not any(
-            p.rotation and p.estimated and p.name not in mountings for p in aid.parameters()
+            p.rotation and p.estimated and p.name not in mountings
+            # That of a USBL is known well enough to start from.
+            for p in (() if isinstance(aid, Usbl) else aid.parameters())
         )
     ]
 
@@ -79,7 +82,7 @@ def mountings_from_motion(
 
     def motion(time: Array) -> tuple[Motion, NDArray[np.bool_]]:
         at, covered = attach_inside(seg, time, frame.earth_rate)
-        near = covered & _near_fixes(trial.gnss, time)
+        near = covered & _near_fixes(trial.fixes, time)
         return motion_at(at, states, gravity_n, frame.earth_rate), near
 
     of_attitude = {}

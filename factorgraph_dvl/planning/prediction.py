@@ -19,8 +19,9 @@ from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import white_noise
 from factorgraph_dvl.simulation import plan_motion, simulate
+from factorgraph_dvl.simulation.course import AngularSway, Heave, StartSettings
 from factorgraph_dvl.simulation.motion import TrueMotion
-from factorgraph_dvl.simulation.scenario import AngularSway, Heave, Scenario, StartSettings
+from factorgraph_dvl.simulation.scenario import Scenario
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.information_along_trial import Frontier
 from factorgraph_dvl.solvers.prediction import TrueStates, continue_posterior, predict_posterior

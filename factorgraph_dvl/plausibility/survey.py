@@ -17,10 +17,12 @@ from factorgraph_dvl.plausibility.imu import channel_findings, force_findings, g
 from factorgraph_dvl.plausibility.planar import planar_findings
 from factorgraph_dvl.plausibility.records import SensorSurvey, record_of, travel
 from factorgraph_dvl.plausibility.star import star_findings
+from factorgraph_dvl.plausibility.usbl import usbl_findings
 from factorgraph_dvl.quality.finding import Code, Finding, errors_of
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.speed_log import SpeedLog
 from factorgraph_dvl.sensors.star import Star
+from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.trial import Trial
 
 # Findings of the sensors together that say better what the gyros' against gravity say.
@@ -69,6 +71,8 @@ def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Fi
     for aid in trial.others:
         if isinstance(aid, Star) and trial.imu is not None:
             yield from star_findings(aid, trial)
+        if isinstance(aid, Usbl):
+            yield from usbl_findings(trial, aid)
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,8 @@ class Code(StrEnum):
     LOG_SIGN = "log_sign"
     DEPTH_SIGN = "depth_sign"
     BEACON_HEIGHT = "beacon_height"
+    USBL_TRACK = "usbl_track", "error"
+    USBL_RUN = "usbl_run"
     AT_REST = "at_rest", "note"
     # Where a solver starts.
     UNUSABLE_PRIOR = "unusable_prior"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import msgspec
 import numpy as np
@@ -35,8 +35,8 @@ RANGE = "range_m"
 RANGE_RATE = "range_rate_m_s"
 NAME = "beacon"
 
-_SOUND_SPEED = ParameterSpec("sound_speed_error", labels=SCALAR)
-SOUND_SPEED_ERROR = _SOUND_SPEED.name
+_SCALE = ParameterSpec("sound_speed_error", labels=SCALAR)
+SOUND_SPEED_ERROR = _SCALE.name
 _CLOCK = Clock.of("beacon", prefix="beacon_")
 
 # Standard deviations from which on a measurement is an echo. Chosen: by chance one in 2000 is.
@@ -45,6 +45,8 @@ GATE = 3.5
 _NAMES = re.compile(r"[A-Za-z0-9_-]+")
 # Stands for the name of any beacon in the names of parameters.
 ANY_BEACON = "NAME"
+# Speed of sound by which a range becomes a travel time, m/s. Chosen: 1 % of it is 1 ms at 150 m.
+_SOUND_SPEED = 1500.0
 
 
 def _offset_spec(beacon: str) -> ParameterSpec:
@@ -55,6 +57,16 @@ def _offset_spec(beacon: str) -> ParameterSpec:
 def offset_name(beacon: str) -> str:
     """Return the name of the parameter that says how far a beacon is off its stated place."""
     return _offset_spec(beacon).name
+
+
+def _bias_spec(beacon: str) -> ParameterSpec:
+    """Return by how much the ranges to a beacon are too long, as by its delay."""
+    return ParameterSpec(f"beacon_{beacon}_range_bias", "m", labels=SCALAR)
+
+
+def bias_name(beacon: str) -> str:
+    """Return the name of the parameter that says how much the ranges to a beacon are too long."""
+    return _bias_spec(beacon).name
 
 
 class BeaconPosition(Section, frozen=True, kw_only=True):
@@ -79,6 +91,9 @@ class BeaconSettings(ClockSection, frozen=True, kw_only=True):
     range_rate_std_m_s: Positive = 0.05
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     sound_speed_error_std: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
+    range_bias_std_m: NonNegative = 0.0
+    stamp: Literal["middle", "reception"] = "middle"
+    turn_around_s: NonNegative = 0.0
     positions: dict[str, BeaconPosition]
 
     def __post_init__(self) -> None:
@@ -123,7 +138,7 @@ class Beacons:
     required: ClassVar[tuple[str, ...]] = ("time_s", NAME)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ((RANGE,), (RANGE_RATE,))
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
-        *(_SOUND_SPEED, _offset_spec(ANY_BEACON)),
+        *(_SCALE, _offset_spec(ANY_BEACON), _bias_spec(ANY_BEACON)),
         *_CLOCK.specs,
     )
 
@@ -175,17 +190,32 @@ class Beacons:
         """Return the errors of sound speed, places and clock."""
         s = self.settings
         return (
-            Parameter(_SOUND_SPEED, np.zeros(1), np.array([s.sound_speed_error_std])),
+            Parameter(_SCALE, np.zeros(1), np.array([s.sound_speed_error_std])),
             *(
                 Parameter(_offset_spec(name), np.zeros(3), np.full(3, position.std_m))
                 for name, position in s.positions.items()
             ),
+            *(
+                Parameter(_bias_spec(name), np.zeros(1), np.array([s.range_bias_std_m]))
+                for name in s.positions
+            ),
             *_CLOCK.parameters(s),
         )
 
+    def _middle(self) -> Array:
+        """Return the stamps of the middles of the sound's ways, (M,), s.
+
+        A way there and back is twice the range from there; the beacon waits before it replies.
+        """
+        s = self.settings
+        if s.stamp == "middle":
+            return self.time
+        way = np.nan_to_num(self.range) / _SOUND_SPEED
+        return np.asarray(self.time - way - 0.5 * s.turn_around_s)
+
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return ranges and range rates, beacon by beacon."""
-        s = self.settings
+        s, time = self.settings, self._middle()
         out: list[Observation] = []
         for name, position in s.positions.items():
             place_n = frame.position(*position.geodetic)
@@ -197,7 +227,7 @@ class Beacons:
                 m = (self.name == name) & ~np.isnan(values)
                 if m.any():
                     arm = np.array(s.lever_arm_m)
-                    out.append(kind(self.time[m], values[m], std, place_n, nRl, arm, name))
+                    out.append(kind(time[m], values[m], std, place_n, nRl, arm, name))
         return tuple(out)
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
@@ -273,14 +303,24 @@ class BeaconRange(_ToBeacon):
 
     The error is zero where
 
-        r = (1 + e) |p_n + nRb l - b_n|
+        r = (1 + e) |p_n + nRb l - b_n| + b
 
-    with the beacon at b_n and 1 + e the ratio of the sound speed that the instrument
-    supposes to the effective one.
+    with the beacon at b_n, 1 + e the ratio of the sound speed that the instrument supposes to
+    the effective one, and b the range that the beacon's delay is off by.
     """
 
     unit: str = "m"
     components: tuple[str, ...] = ("range",)
+
+    @property
+    def bias(self) -> str:
+        """Name of the parameter of what the ranges are too long by."""
+        return bias_name(self.beacon)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the calibration parameters that the measurement depends on."""
+        return (*super().parameters, self.bias)
 
     @property
     def label(self) -> str:
@@ -294,7 +334,8 @@ class BeaconRange(_ToBeacon):
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 1), m."""
         distance, _ = self._geometry(motion, values)
-        return ((1.0 + values[SOUND_SPEED_ERROR]) * distance - self.measured)[:, None]
+        predicted = (1.0 + values[SOUND_SPEED_ERROR]) * distance + values[self.bias]
+        return (predicted - self.measured)[:, None]
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
@@ -304,9 +345,10 @@ class BeaconRange(_ToBeacon):
         derivatives: dict[str, Callable[[], Array]] = {
             SOUND_SPEED_ERROR: lambda: distance[:, None, None],
             self.offset: lambda: -d_p @ self.nRl,
+            self.bias: lambda: np.ones((distance.size, 1, 1)),
         }
         return Linearization(
-            residual=(scale * distance - self.measured)[:, None],
+            residual=(scale * distance + values[self.bias] - self.measured)[:, None],
             d_theta=-d_p @ motion.nRb @ skew(self.arm_b),
             d_p=d_p,
             d_parameters={name: make() for name, make in derivatives.items() if name in wanted},

@@ -9,7 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.sensors.attitude import Attitude
-from factorgraph_dvl.sensors.beacon import ANY_BEACON, Beacons, offset_name
+from factorgraph_dvl.sensors.beacon import ANY_BEACON, Beacons, bias_name, offset_name
 from factorgraph_dvl.sensors.depth import Depth
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -21,10 +21,11 @@ from factorgraph_dvl.sensors.protocol import Aid, SensorRecord
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.star import Star
 from factorgraph_dvl.sensors.turntable import Turntable
+from factorgraph_dvl.sensors.usbl import Usbl
 
 AIDS: tuple[type[Aid], ...] = (
     *(Gnss, Dvl, Ins, Attitude, Heading, SpeedLog, Star, Depth),
-    *(DvlBeams, Turntable, Beacons),
+    *(DvlBeams, Turntable, Beacons, Usbl),
 )
 
 
@@ -89,8 +90,10 @@ def _loaded(entry: EntryPoint) -> type[Aid]:
 PLANAR: tuple[type[Aid], ...] = (Heading, SpeedLog, Depth, Beacons)
 
 
-# Offsets of beacons, whose names are the user's, from any text around them.
-BEACON_OFFSET = re.compile(offset_name(r"([^\s\"':,{}]+)") + r"\b")
+# Offsets and biases of beacons, whose names are the user's, from any text around them.
+_ANY_NAME = r"([^\s\"':,{}]+?)"
+BEACON_OFFSET = re.compile(offset_name(_ANY_NAME) + r"\b")
+_OF_BEACONS = {offset_name: BEACON_OFFSET, bias_name: re.compile(bias_name(_ANY_NAME))}
 
 
 def every_spec() -> tuple[ParameterSpec, ...]:
@@ -102,11 +105,12 @@ def every_spec() -> tuple[ParameterSpec, ...]:
 def specs_of(name: str) -> dict[int, ParameterSpec]:
     """Return what a parameter may be, by its number of components; empty if none knows it."""
     found = {spec.size: spec for spec in every_spec() if spec.name == name}
-    beacon = BEACON_OFFSET.fullmatch(name)
-    if found or beacon is None:
+    if found:
         return found
-    offsets = specs_of(offset_name(ANY_BEACON))
-    return {
-        n: replace(spec, stem=spec.stem.replace(ANY_BEACON, beacon[1]))
-        for n, spec in offsets.items()
-    }
+    for named, pattern in _OF_BEACONS.items():
+        if beacon := pattern.fullmatch(name):
+            return {
+                n: replace(spec, stem=spec.stem.replace(ANY_BEACON, beacon[1]))
+                for n, spec in specs_of(named(ANY_BEACON)).items()
+            }
+    return {}

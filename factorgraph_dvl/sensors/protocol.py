@@ -348,7 +348,8 @@ class SensorRecord(Protocol):
     `section` names its part of trial.yaml and its table, `section_type` contains the
     settings, `specs` lists what can be calibrated, with each number of components. Of the
     columns, `required` and the settings' `more_columns` must be there, and of each group of
-    `optional` ones all or none.
+    `optional` ones all or none. A record that has another one, with its section within its own,
+    names it in `parts`; `parts_of` returns those that there are.
     """
 
     section: ClassVar[str]
@@ -367,6 +368,17 @@ class SensorRecord(Protocol):
 
     def columns(self) -> dict[str, Array]:
         """Return the record as a table."""
+
+
+def part_types(kind: type[SensorRecord]) -> Mapping[str, type[SensorRecord]]:
+    """Return the records that one may have within itself, by key and attribute."""
+    return getattr(kind, "parts", {})
+
+
+def parts_of(record: SensorRecord) -> dict[str, SensorRecord]:
+    """Return the records that one has within itself, by key and attribute."""
+    found = {name: getattr(record, name) for name in part_types(type(record))}
+    return {name: part for name, part in found.items() if part is not None}
 
 
 class Aid(SensorRecord, Protocol):

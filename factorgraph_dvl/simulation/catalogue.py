@@ -34,6 +34,7 @@ from factorgraph_dvl.simulation.ranging import (
     simulate_log,
 )
 from factorgraph_dvl.simulation.star import simulate_star
+from factorgraph_dvl.simulation.usbl import UsblTruth, simulate_usbl
 
 
 class Instrument(NamedTuple):
@@ -57,6 +58,7 @@ INSTRUMENTS = {
     "ins": Instrument(InsTruth, simulate_ins),
     "heading": Instrument(HeadingTruth, simulate_heading),
     "log": Instrument(LogTruth, simulate_log),
+    "usbl": Instrument(UsblTruth, simulate_usbl),
 }
 # Of a planar trial, likewise in the order of its streams.
 PLANAR_INSTRUMENTS = {kind.section: INSTRUMENTS[kind.section] for kind in PLANAR}

@@ -24,6 +24,9 @@ from factorgraph_dvl.simulation.instruments import (
 from factorgraph_dvl.simulation.measurements import displaced, sample_times, within
 from factorgraph_dvl.simulation.motion import TrueMotion
 
+# Speed of sound that the instrument supposes, m/s.
+_SUPPOSED = 1500.0
+
 
 def simulate_beacons(
     scenario: ScenarioView, motion: TrueMotion, rng: np.random.Generator
@@ -33,7 +36,7 @@ def simulate_beacons(
     Distances are straight lines in Earth-centred coordinates, times 1 + e.
     """
     truth: BeaconTruth = scenario.beacons
-    jitter_rng, place_rng, noise_rng, fault_rng = rng.spawn(4)
+    jitter_rng, place_rng, noise_rng, fault_rng, bias_rng = rng.spawn(5)
     time = sample_times(truth, motion.duration, jitter_rng)
     names = list(truth.positions)
     asked = np.arange(time.size) % len(names)
@@ -43,6 +46,7 @@ def simulate_beacons(
     place = displaced(stated, offset)
     error = truth.sound_speed_error
     scale = 1.0 + (drawn[0, 0] * truth.sound_speed_error_std if error == "draw" else error)
+    bias = truth.range_bias_std_m * bias_rng.standard_normal(len(names))
 
     state = motion.at(time)
     nRb = rotation_from_rph(state.rph, scenario.body_axes)
@@ -55,7 +59,10 @@ def simulate_beacons(
     distance = np.linalg.norm(separation, axis=1)
     lat, lon = state.geodetic[:, :2].T
     direction = np.stack(pymap3d.ecef2enuv(*separation.T, lat, lon, deg=False), axis=1)
-    ranges = scale * distance
+    ranges = scale * distance + bias[asked]
+    stamps = time
+    if truth.stamp == "reception":
+        stamps = time + scale * distance / _SUPPOSED + 0.5 * truth.turn_around_s
     rates = scale * np.sum(direction * velocity, axis=1) / distance
     draws = noise_rng.standard_normal((time.size, 2))
     lost, longer, length = fault_rng.uniform(size=(3, time.size))
@@ -70,9 +77,10 @@ def simulate_beacons(
     keep = ~within(time, truth.outages_s)
     calibration = {"sound_speed_error": np.array([scale - 1.0])}
     calibration |= {f"beacon_{n}_offset_m": offset[i] for i, n in enumerate(names)}
+    calibration |= {f"beacon_{n}_range_bias_m": bias[i : i + 1] for i, n in enumerate(names)}
     record = Beacons(
         settings=cast("BeaconSettings", scenario.settings("beacons")),
-        time=time[keep],
+        time=stamps[keep],
         name=np.array(names)[asked[keep]],
         range=ranges[keep],
         range_rate=rates[keep],
@@ -160,7 +168,7 @@ class BeaconTruth(SimulatedInstrument, frozen=True, kw_only=True):
     `positions` are the true places but for `std_m`: each seed draws a place around the
     stated one. A range is lost with probability `missed`, and longer by a uniform draw from
     `multipath_m` with probability `multipath`. `sound_speed_error: draw` takes it from
-    N(0, std²).
+    N(0, std²). Each beacon's ranges are too long by a draw from N(0, range_bias_std_m²).
     """
 
     section_type: ClassVar[type[SensorSection]] = BeaconSettings
@@ -174,6 +182,9 @@ class BeaconTruth(SimulatedInstrument, frozen=True, kw_only=True):
     missed: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     multipath: Annotated[float, msgspec.Meta(ge=0, le=1)] = 0.0
     multipath_m: tuple[float, float] = (10.0, 50.0)
+    range_bias_std_m: NonNegative = 0.0
+    stamp: Literal["middle", "reception"] = "middle"
+    turn_around_s: NonNegative = 0.0
     outages_s: tuple[Interval, ...] = ()
 
     def __post_init__(self) -> None:
@@ -187,6 +198,9 @@ class BeaconTruth(SimulatedInstrument, frozen=True, kw_only=True):
             "positions": msgspec.to_builtins(self.positions),
             "lever_arm_m": self.lever_arm_m,
             "sound_speed_error_std": self.sound_speed_error_std,
+            "range_bias_std_m": self.range_bias_std_m,
+            "stamp": self.stamp,
+            "turn_around_s": self.turn_around_s,
         }
         if self.range_std_m > 0.0:
             out["range_std_m"] = self.range_std_m

@@ -27,6 +27,7 @@ dvl: {...}                         # DvlTruth, optional
 depth: {...}                       # DepthTruth, optional
 star: {...}                        # StarTruth, optional
 beacons: {...}                     # BeaconTruth, optional
+usbl: {...}                        # UsblTruth, optional, with the ship above the vehicle
 dvl_beams: {...}                   # DvlBeamsTruth, optional
 attitude: {...}                    # AttitudeTruth, optional, beside or in place of imu
 ins: {...}                         # InsTruth, optional, likewise
@@ -53,7 +54,7 @@ from collections.abc import Mapping
 from datetime import date
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -61,49 +62,12 @@ from factorgraph_dvl.errors import ConfigError, printable
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.sensors.protocol import NoiseModel, SensorSection
 from factorgraph_dvl.settings.convert import convert
-from factorgraph_dvl.settings.sections import NonNegative, Positive, Section, Vector3, check_epoch
+from factorgraph_dvl.settings.sections import Positive, Section, Vector3, check_epoch
 from factorgraph_dvl.settings.yaml_file import read_yaml
 from factorgraph_dvl.simulation.catalogue import INSTRUMENTS, PLANAR_INSTRUMENTS
+from factorgraph_dvl.simulation.course import StartSettings, SwaySettings
 from factorgraph_dvl.simulation.instruments import ImuTruth, SimulatedInstrument
 from factorgraph_dvl.simulation.manoeuvres import Manoeuvre, flatten
-
-Latitude = Annotated[float, msgspec.Meta(ge=-89, le=89)]
-Longitude = Annotated[float, msgspec.Meta(ge=-360, le=360)]
-
-
-class StartSettings(Section, frozen=True, kw_only=True):
-    """Position, heading and speed of the vehicle at time zero."""
-
-    lat_deg: Latitude
-    lon_deg: Longitude
-    height_m: float = 0.0
-    heading_deg: float = 0.0
-    speed_m_s: NonNegative = 0.0
-
-
-class AngularSway(Section, frozen=True, kw_only=True):
-    """A sinusoid of an angle."""
-
-    amplitude_deg: float
-    frequency_hz: Positive
-    phase_deg: float = 0.0
-
-
-class Heave(Section, frozen=True, kw_only=True):
-    """A sinusoid of the height."""
-
-    amplitude_m: float
-    frequency_hz: Positive
-    phase_deg: float = 0.0
-
-
-class SwaySettings(Section, frozen=True, kw_only=True):
-    """Sway of the vehicle by the sea."""
-
-    roll: tuple[AngularSway, ...] = ()
-    pitch: tuple[AngularSway, ...] = ()
-    yaw: tuple[AngularSway, ...] = ()
-    heave: tuple[Heave, ...] = ()
 
 
 class InitialClaim(Section, frozen=True, kw_only=True):

@@ -57,7 +57,7 @@ def _stated(scenario: ScenarioView, seed: int) -> dict[str, Fault]:
             out["dvl bias"] = faults.dvl_bias(bias.tolist())
     if scenario.imu is not None:
         out |= _imu_errors(scenario, seed)
-    for section in ("gnss", "dvl", "dvl_beams", "imu"):
+    for section in ("gnss", "dvl", "dvl_beams", "usbl", "imu"):
         truth = getattr(scenario, section)
         if truth is None:
             continue

@@ -209,7 +209,8 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     inc, gaps = increments(trial.inertial)
     seg = segments(inc, state_interval_s, dense_epochs(trial, frame, state_interval_s))
     report("alignment", 0, None)
-    on_one_clock = trial.on_one_clock()
+    # A USBL is a position like any other to start from.
+    on_one_clock = trial.on_one_clock().with_fixes()
     start = initial_states(on_one_clock, frame, seg)
     if trial.beacons is not None:
         report("ranges", 0, None)
@@ -297,9 +298,9 @@ def mounted_start(
         if 2.0 * evaluation.cost > _GROSS * count:
             gross, evaluation = robust_weights(problem, evaluation) or (gross, evaluation)
         states = evaluation.states
-        assert prepared.trial.gnss is not None
+        assert prepared.trial.positioning is not None
         found = evaluation.parameters
-        values = values | {p.name: found[p.name] for p in prepared.trial.gnss.parameters()}
+        values = values | {p.name: found[p.name] for p in prepared.trial.positioning.parameters()}
     report("mounting", 0, None)
     (best, *_) = prepared.mountings_at(chain, states)
     return MountedStart(states, values | best, gross, iterations)

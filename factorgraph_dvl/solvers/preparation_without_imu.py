@@ -42,7 +42,7 @@ from factorgraph_dvl.trial import Trial
 
 CURRENT = "current"
 # Sensors that ask more of the motion than a motion prior gives.
-_NEED_IMU = frozenset({"star", "turntable", "beacons"})
+_NEED_IMU = frozenset({"star", "turntable"})
 # Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
 _TURNING = 0.4 * DEG
 TURN_SPAN = 10.0
@@ -193,7 +193,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
         raise ConfigError(
             "nothing measures the position",
             where="trial.yaml",
-            expected="with `attitude`, also `gnss` or `ins`",
+            expected="with `attitude`, also `gnss`, `usbl` or `ins`",
         )
     for aid in trial.aids:
         if aid.section in _NEED_IMU:
@@ -381,7 +381,8 @@ def _parameters(trial: Trial) -> tuple[Parameter, ...]:
 
     Without an IMU only differences of clocks show.
     """
-    section = "ins" if trial.gnss is None else "gnss"
+    assert trial.positioning is not None
+    section = trial.positioning.section
     out = []
     for aid in trial.aids:
         for p in aid.parameters():
@@ -469,7 +470,7 @@ def node_clock(trial: Trial, frame: LocalFrame) -> str:
     Its measurements stay where they are between nodes when its clock moves; with weights of the
     clock before, that of a DVL was damped 13 times as strongly as the data pulled it.
     """
-    sensor = trial.dvl or trial.beams or trial.find(Ins) or trial.gnss
+    sensor = trial.dvl or trial.beams or trial.find(Ins) or trial.positioning
     assert sensor is not None
     clock = sensor.observations(frame, trial.body_axes)[0].clock
     assert clock is not None

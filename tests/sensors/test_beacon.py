@@ -20,7 +20,7 @@ from factorgraph_dvl.imu.increments import increments
 from factorgraph_dvl.imu.preintegration import segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.replay import replay
-from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, offset_name
+from factorgraph_dvl.sensors.beacon import Beacons, BeaconSettings, bias_name, offset_name
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -104,6 +104,8 @@ def test_jacobians():
             "sound_speed_error": np.array([0.01]),
             offset_name("B1"): np.array([1.0, -2.0, 0.5]),
             offset_name("far"): np.array([0.3, 0.1, -2.0]),
+            bias_name("B1"): np.array([0.7]),
+            bias_name("far"): np.array([-0.4]),
         }
         check_jacobians(o, motion, values, r.parameters(), tolerance=1e-6)
 
@@ -125,9 +127,10 @@ def test_by_hand():
         omega_eb_b=np.array([[0.0, 0.0, 0.5]]),
     )
     values = {"sound_speed_error": np.array([0.1]), offset_name("B1"): np.zeros(3)}
+    values[bias_name("B1")] = np.array([0.2])
     distance, rate = r.observations(frame, "RFU")
     # The transponder is at (3, 4), 5 m away, and moves with (3, 0) + 0.5 · 2 to the north.
-    np.testing.assert_allclose(distance.residual(motion, values), [[1.1 * 5.0]], atol=1e-8)
+    np.testing.assert_allclose(distance.residual(motion, values), [[1.1 * 5.0 + 0.2]], atol=1e-8)
     np.testing.assert_allclose(rate.residual(motion, values), [[1.1 * (9.0 + 4.0) / 5.0]])
 
 
@@ -145,6 +148,7 @@ def test_a_two_way_range_is_that_of_its_middle():
         settings, one, np.array(["B1"]), 0.5 * sound * (out + back) * one, np.full(1, np.nan)
     )
     values = {"sound_speed_error": np.zeros(1), offset_name("B1"): np.zeros(3)}
+    values[bias_name("B1")] = np.zeros(1)
     (o, *_) = r.observations(frame, "RFU")
 
     def error(since):
@@ -153,6 +157,28 @@ def test_a_two_way_range_is_that_of_its_middle():
 
     assert error(0.5 * (out + back)) < 2e-3
     assert error(out + back) > 1.0
+
+
+def test_stamps_of_reception_and_delays_are_those_of_the_simulated_sound():
+    """Ranges there and back, stamped when they come, too long by an unknown delay."""
+    scene = scenario(
+        beacons=beacons(
+            positions={"B1": PLACE, "B2": {**PLACE, "lon_deg": 121.01}},
+            stamp="reception",
+            turn_around_s=0.3,
+            range_bias_std_m=2.0,
+        )
+    )
+    exact, trial = plan_motion(scene), simulate(scene, seed=5)
+    frame = LocalFrame(*exact.at(np.array([0.0])).geodetic[0])
+    values = trial.calibration_truth
+    assert trial.beacons.settings.range_bias_std_m == 2.0
+    assert abs(values["beacon_B1_range_bias_m"][0]) > 0.1
+    for o in trial.beacons.observations(frame, "RFU"):
+        if o.unit == "m":
+            error = o.residual(exact_motion(exact, frame, o.time), values)
+            # The bias is no way of the sound: 2 m of it are 1.3 ms, at up to 5 m/s.
+            assert np.abs(error).max() < 5.0 * 2.0 / 1500.0 * abs(values[o.bias][0])
 
 
 def dive(**changes):

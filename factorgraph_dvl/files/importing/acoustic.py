@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,6 +18,11 @@ from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
+# Formats whose fixes are of a transponder under water.
+UNDER_WATER = ("underwater-gps", "usbl-sentences")
+# Those of them beside whose places sentences of GNSS and compass are the vessel's.
+_BESIDE_SENTENCES = "usbl-sentences"
+_SENTENCES = "nmea"
 # Chosen: of a true heading by GNSS or a gyrocompass that states none.
 _HEADING_STD = 1.0 * DEG
 # Chosen: time between records of the vessel, s, beyond which it is not known where it was.
@@ -43,6 +49,7 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
     list of Timed
         Without the kinds `acoustic` and `topside`, whose motion is not that of the vehicle.
     """
+    streams = _of_one_transponder(_with_vessel(streams, decisions), decisions)
     others = [t for t in streams if t.stream.kind not in ("acoustic", "topside")]
     places = merge([t for t in streams if t.stream.kind == "acoustic"], decisions)
     if places is None:
@@ -59,7 +66,7 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
         places.label,
         f"relative to the vessel, whose position is that of {position.label} and whose heading "
         f"that of {heading.label} → fixes of the vehicle, heights below the surface",
-        "gnss.file",
+        "usbl.file",
     )
     first = places.streams[0].stream
     times: list[Array] = []
@@ -74,6 +81,51 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
         first.file, first.format, "fix", "utc", first.stream, "", "unknown", (), records
     )
     return [*others, Timed.of(stream, times, spool)]
+
+
+def _with_vessel(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    """Return streams with fixes and headings beside places of a USBL as those of the vessel."""
+    if not any(
+        t.stream.format == _BESIDE_SENTENCES and t.stream.kind == "acoustic" for t in streams
+    ):
+        return list(streams)
+    out = []
+    for timed in streams:
+        stream = timed.stream
+        of_vessel = stream.format == _SENTENCES and stream.kind in ("fix", "attitude")
+        if of_vessel:
+            decisions.add(
+                stream.label, "beside places of a USBL → position or heading of the ship"
+            )
+            records = stream.records.converted(_as_topside)
+            stream = replace(stream, kind="topside", records=records)
+            timed = replace(timed, stream=stream)
+        out.append(timed)
+    return out
+
+
+def _as_topside(records: Records) -> Records:
+    out = empty("topside", len(records))
+    for name in set(out.dtype.names or ()) & set(records.dtype.names or ()):
+        out[name] = records[name]
+    return out
+
+
+def _of_one_transponder(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
+    """Return streams without the positions of other transponders than the one most often seen."""
+    under = [
+        t
+        for t in streams
+        if t.stream.format == _BESIDE_SENTENCES and t.stream.kind in ("acoustic", "fix")
+    ]
+    names = {t.stream.stream for t in under}
+    if len(names) < 2:
+        return list(streams)
+    counts = {n: sum(t.known for t in under if t.stream.stream == n) for n in names}
+    best = max(sorted(counts), key=lambda name: counts[name])
+    others = ", ".join(f"{name} ({counts[name]})" for name in sorted(counts) if name != best)
+    decisions.add(best, f"{counts[best]} positions; other transponders left out: {others}")
+    return [t for t in streams if t not in under or t.stream.stream == best]
 
 
 def _fullest(streams: Sequence[Timed], name: str, decisions: Decisions) -> Merged | None:

@@ -13,6 +13,7 @@ import numpy as np
 from factorgraph_dvl.files.formats.format import empty
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing import motion, orientation, positions, velocity
+from factorgraph_dvl.files.importing.acoustic import UNDER_WATER
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import Merged
 from factorgraph_dvl.files.importing.time_base import FIRST_DATE, Timed
@@ -108,7 +109,9 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
             "imu.grade",
         )
     if gnss is not None:
-        _add_gnss(out, gnss, imu is not None or ins is not None)
+        under_water = gnss.fixes.streams[0].stream.format in UNDER_WATER
+        add = _add_usbl if under_water else _add_gnss
+        add(out, gnss, imu is not None or ins is not None)
     if ins is not None:
         _add_ins(out, ins, motion.choose(streams, "ins_std", decisions))
     log = velocity.choose(streams, decisions)
@@ -172,6 +175,22 @@ def _place(
             part = timed.stream.records[:1000]
             return float(np.nanmedian(part["lat"])), float(np.nanmedian(part["lon"]))
     return None
+
+
+def _add_usbl(out: Assembly, fixes: positions.Positions, has_body: bool) -> None:
+    """Add positions of a transponder under water."""
+    keys: dict[str, Any] = {"transponder_lever_arm_m": [0.0, 0.0, 0.0]}
+    out.decisions.add(
+        "usbl.transponder_lever_arm_m",
+        "no file states where the transponder is on the vehicle → at the origin of the body; "
+        "measure it, and state it",
+    )
+    if not has_body:
+        keys["time_offset_std_s"] = 0.0
+        out.decisions.add(
+            "usbl.time_offset_std_s", "no IMU → the clock of the positions is that of the trial"
+        )
+    out.add("usbl", fixes.tables, **keys)
 
 
 def _add_gnss(out: Assembly, gnss: positions.Positions, has_body: bool) -> None:

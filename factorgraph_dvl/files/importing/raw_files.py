@@ -33,7 +33,7 @@ from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.importing.time_base import on_utc
 
 NEW_SETTINGS = "trial.yaml.new"
-_SECTIONS = ("imu", "ins", "gnss", "attitude", "dvl", "dvl_beams", "depth")
+_SECTIONS = ("imu", "ins", "gnss", "usbl", "attitude", "dvl", "dvl_beams", "depth")
 # The log first: a folder without it was not written by an import.
 OWNED = (LOG_FILE, SETTINGS_FILE, NEW_SETTINGS, *(name + SUFFIX for name in _SECTIONS))
 _SPOOL = ".spool"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import format_samples as samples
+import format_writers as writers
 import numpy as np
 import pytest
 
@@ -20,7 +21,7 @@ def imported(tmp_path, *names, **keys):
     for name in names:
         paths.append(tmp_path / f"{name}.csv")
         paths[-1].write_bytes(tables[name])
-    return import_files(paths, tmp_path / "trial"), tmp_path / "trial" / "gnss.parquet"
+    return import_files(paths, tmp_path / "trial"), tmp_path / "trial" / "usbl.parquet"
 
 
 def columns(path, *names):
@@ -72,7 +73,48 @@ def test_the_vessel_is_not_known_in_a_gap(tmp_path):
     (tmp_path / "a.csv").write_bytes(tables["acoustic"])
     (tmp_path / "b.csv").write_bytes(b"".join(lines[:20] + lines[60:]))
     import_files([tmp_path / "a.csv", tmp_path / "b.csv"], tmp_path / "trial")
-    time, lat = columns(tmp_path / "trial" / "gnss.parquet", "time_s", "lat_deg")
+    time, lat = columns(tmp_path / "trial" / "usbl.parquet", "time_s", "lat_deg")
     inside = (time > 4.8) & (time < 14.7)
     assert np.isnan(lat[inside]).all()
     assert np.isfinite(lat[~inside]).all()
+
+
+def test_sentences_of_a_usbl_beside_those_of_the_ship(tmp_path):
+    """10 m ahead and 5 m to starboard of a ship with the bow to the east; another transponder."""
+    lines = []
+    for k in range(20):
+        at = f"1200{k:02d}.00"
+        lines += [
+            writers.nmea(f"GPZDA,{at},01,06,2023,00,00"),
+            writers.nmea(f"GPGGA,{at},5400.0000,N,00300.0000,W,4,12,0.6,10.0,M,50.0,M,,"),
+            writers.nmea("HEHDT,90.0,T"),
+            writers.nmea(f"PSIMSSB,{at},B01,A,,C,H,M,5.0,10.0,30.0,1.5,N,,"),
+        ]
+        if k % 4 == 0:
+            lines.append(writers.nmea(f"PSIMSSB,{at},B02,A,,C,H,M,50.0,-10.0,60.0,1.5,N,,"))
+    (tmp_path / "ship.log").write_bytes(b"".join(lines))
+    decisions = import_files([tmp_path / "ship.log"], tmp_path / "trial")
+    path = tmp_path / "trial" / "usbl.parquet"
+    lat, lon, height = columns(path, "lat_deg", "lon_deg", "height_m")
+    meridian, transverse = radii(54.0 * DEG)
+    np.testing.assert_allclose((lat - 54.0) * DEG * meridian, -5.0, atol=1e-3)
+    east = (lon + 3.0) * DEG * transverse * np.cos(54.0 * DEG)
+    np.testing.assert_allclose(east, 10.0, atol=1e-3)
+    np.testing.assert_allclose(height, -30.0)
+    assert lat.size == 20
+    assert "other transponders left out: PSIMSSB B02 (5)" in decisions.text("")
+
+
+def test_positions_by_the_example_of_the_document(tmp_path):
+    lines = [
+        "PTSAG,#16068,124544.449,18,12,2017,1,4305.25355,N,00631.76852,E,F,1013.10,1,9999.00",
+        "PTSAG,#16069,124545.449,18,12,2017,1,4305.25355,N,00631.76852,E,F,1013.10,1,9999.00",
+        "PTSAG,#16071,124546.173,18,12,2017,0,4305.25123,N,00631.79102,E,F,0002.89,1,9999.00",
+    ]
+    (tmp_path / "gaps.txt").write_bytes(b"".join(map(writers.nmea, lines)))
+    import_files([tmp_path / "gaps.txt"], tmp_path / "trial")
+    names = ("lat_deg", "lon_deg", "height_m")
+    lat, lon, height = columns(tmp_path / "trial" / "usbl.parquet", *names)
+    np.testing.assert_allclose(lat, 43.0 + 5.25355 / 60.0)
+    np.testing.assert_allclose(lon, 6.0 + 31.76852 / 60.0)
+    np.testing.assert_allclose(height, -1013.1)
