@@ -261,7 +261,7 @@ def heading_error(
 
     The deviation is that of the heading by the compass, as on a deviation card (A. Smith's
     formula: Admiralty Manual for the Deviations of the Compass). By the true heading, it would
-    stretch the heading, and no compass tells a stretched heading from a faster turn.
+    stretch the heading, and to a compass a stretched heading looks like a faster turn.
 
     Parameters
     ----------

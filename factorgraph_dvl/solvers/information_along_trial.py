@@ -25,7 +25,8 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray, sums_before
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
 from factorgraph_dvl.solvers.batch import solve_with_problem
-from factorgraph_dvl.solvers.calibration import prior_along, reported
+from factorgraph_dvl.solvers.calibration import changes_of, prior_along, reported
+from factorgraph_dvl.solvers.considered_errors import ConsideredError
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
@@ -94,7 +95,10 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
     shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
     triangles, _ = run_filter(problem, evaluation, nodes=shown)
     undetermined = _undetermined(found, triangles, shown)
-    return as_history(problem, evaluation, found.fixed, triangles, undetermined, nodes=shown)
+    errors = found.covariances.errors
+    return as_history(
+        problem, evaluation, found.fixed, triangles, undetermined, nodes=shown, errors=errors
+    )
 
 
 def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[int, Array]:
@@ -190,6 +194,7 @@ def as_history(
     undetermined: Mapping[int, Array],
     *,
     nodes: Array | None = None,
+    errors: Sequence[ConsideredError] = (),
 ) -> InformationHistory:
     """Return triangles over the constants in reported parametrisation and units.
 
@@ -205,12 +210,16 @@ def as_history(
         Further directions that are at their prior, by entry.
     nodes : ndarray of int, optional
         Nodes of the triangles; by default every node.
+    errors : sequence of ConsideredError, optional
+        Errors that are considered at the last of them. Before, they move a component by the share
+        of its prior variance that the data have explained.
     """
     columns = _constants(problem)
     names: list[str] = []
     rows: list[Array] = []
     kept: list[dict[int, Array]] = []
     free: list[np.ndarray] = []
+    priors: list[Array] = []
     for parameter, _, functional in reported(problem, evaluation):
         if functional is None or not functional.keys() <= columns.keys():
             continue
@@ -221,6 +230,7 @@ def as_history(
         kept.append(functional)
         names += parameter.component_names
         free.append(parameter.sigma > 0.0)
+        priors.append(parameter.sigma / parameter.si)
     is_free = np.concatenate(free)
     transport = np.concatenate(rows)[is_free]
     whiten = np.linalg.inv(problem.prior_root)
@@ -243,6 +253,12 @@ def as_history(
         if info != 0:
             raise np.linalg.LinAlgError("a constant without a prior")
         root[k] = _triangle(np.hstack([transport @ inverse, spread]).T, size).T
+    if errors:
+        changes = np.hstack([changes_of(kept, error.changes) for error in errors])[is_free]
+        taken = np.concatenate(priors)[is_free] ** 2 - np.sum(root**2, axis=2)
+        share = np.clip(taken / np.maximum(taken[-1], np.finfo(float).tiny), 0.0, 1.0)
+        for k, moved in enumerate(np.sqrt(share)[:, :, None] * changes):
+            root[k] = _triangle(np.hstack([root[k], moved]).T, size).T
     time = problem.chain.node_time
     return InformationHistory(
         time=time if nodes is None else time[nodes],

@@ -382,12 +382,24 @@ def _bent(
 
 
 def factorized(
+    problem: Problem, evaluation: Evaluation
+) -> tuple[SquareRootInformation, gtsam.VectorValues]:
+    """Return the square-root information from QR at some values, and the step to the minimum."""
+    gaussian = [problem.linearize(evaluation)]
+    ordering = problem.ordering(branches=False)
+    # Nothing else holds the factors then, so that each goes once it is eliminated.
+    problem.release()
+    out = eliminated(gaussian.pop(), ordering, evaluation.values.dims())
+    return out, out.solution()
+
+
+def quickly_factorized(
     problem: Problem, evaluation: Evaluation, *, rough: bool = False
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
-    """Return the square-root information at some values, and the step to the minimum.
+    """Return what `factorized` does, by Cholesky: from QR where that loses digits.
 
-    From QR. A chain that interpolates has it from Cholesky's factorisation, which takes a third of
-    the time, unless that loses digits, as it may across a gap of a record.
+    It takes a third of the time. Across a gap of a record it may lose digits: for what compares
+    assumptions, not for the standard deviations of a result.
 
     Parameters
     ----------
@@ -398,19 +410,16 @@ def factorized(
     rough : bool, default False
         Whether lost digits do not matter: what is made of it is estimated again.
     """
-    gaussian = [problem.linearize(evaluation)]
-    sizes = evaluation.values.dims()
-    if problem.chain.interpolates:
-        tree = cholesky(gaussian[0], problem.ordering())
-        if tree is not None:
-            out = SquareRootInformation([tree], sizes)
-            if rough or _has_digits(problem, gaussian[0], out):
-                problem.release()
-                return out, out.solution()
-    # Nothing else holds the factors then, so that each goes once it is eliminated.
-    problem.release()
-    out = eliminated(gaussian.pop(), problem.ordering(branches=False), sizes)
-    return out, out.solution()
+    gaussian = problem.linearize(evaluation)
+    tree = cholesky(gaussian, problem.ordering())
+    if tree is not None:
+        out = SquareRootInformation([tree], evaluation.values.dims())
+        if rough or _has_digits(problem, gaussian, out):
+            del gaussian
+            problem.release()
+            return out, out.solution()
+    del gaussian
+    return factorized(problem, evaluation)
 
 
 def _has_digits(

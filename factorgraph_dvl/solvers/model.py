@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import ConstantsPrior, Tilt, local_coordinates
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
@@ -20,9 +22,11 @@ from factorgraph_dvl.solvers.levenberg_marquardt import (
     Minimum,
     factorized,
     minimise,
+    quickly_factorized,
 )
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.statistics.marginal_likelihood import constants_of, restricted_objective
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Root mean square change of the positions, m, from which on gravity is taken anew. Chosen: 1 m
 # turns it by 0.16 micro-g.
@@ -295,9 +299,8 @@ def with_objective(
     if problem.chain.interpolates:
         # Where constants are at a maximum of their likelihood, the cost has none.
         evaluation = problem.weighed(problem.without_tilt(evaluation))
-        tilt, problem.tilt = problem.tilt, None
-        information = factorized(problem, evaluation, rough=rough)[0]
-        problem.tilt = tilt
+        factorize = partial(quickly_factorized, rough=rough)
+        information = _without_tilt(problem, evaluation, factorize)
         model = replace(model, reference=(evaluation.states, evaluation.parameters))
     elif information is None:
         information = factorized(problem, evaluation)[0]
@@ -307,3 +310,23 @@ def with_objective(
         objective += 2.0 * information.given(constants_of(problem)).decrease
     minimum = replace(minimum, square_root=information)
     return Estimated(model, problem, minimum, objective, rough)
+
+
+def with_all_digits(at: Estimated) -> Minimum:
+    """Return the minimum with square-root information from QR, for its standard deviations."""
+    minimum = at.minimum
+    if not at.problem.chain.interpolates:
+        return minimum
+    return replace(minimum, square_root=_without_tilt(at.problem, minimum.evaluation, factorized))
+
+
+def _without_tilt(
+    problem: Problem,
+    evaluation: Evaluation,
+    factorize: Callable[[Problem, Evaluation], tuple[SquareRootInformation, gtsam.VectorValues]],
+) -> SquareRootInformation:
+    """Return the square-root information of the residuals alone."""
+    tilt, problem.tilt = problem.tilt, None
+    information = factorize(problem, evaluation)[0]
+    problem.tilt = tilt
+    return information

@@ -23,7 +23,7 @@ from factorgraph_dvl.solvers.averaging import averaging_findings
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_others
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised
+from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised, with_all_digits
 from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.solvers.steps import (
     Averaging,
@@ -135,10 +135,9 @@ def settle(
     if going_on:
         text = message("not_converged.steps", count=len(record))
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
+    minimum = with_all_digits(at)
     at.problem.release()
-    minimum = replace(
-        at.minimum, converged=at.minimum.converged and not going_on, iterations=iterations
-    )
+    minimum = replace(minimum, converged=minimum.converged and not going_on, iterations=iterations)
     return SettledMinimum(at.problem, minimum, not going_on, findings, tuple(record))
 
 

@@ -315,10 +315,12 @@ def test_a_factor_says_that_it_leaves_a_window_out():
     chain = preintegrate(trial.imu, np.arange(10.0, 12.0), frame)
     (velocity,) = trial.dvl.observations(frame, trial.body_axes)
     values = gtsam.Values()
-    values.insert(1, gtsam.NavState())
+    for key in (1, 3):
+        values.insert(key, gtsam.NavState())
     values.insert(2, gtsam.imuBias.ConstantBias())
+    key_of = {"state": 1, "bias": 2, "state_after": 3}
     with pytest.warns(UserWarning, match="window"):
-        sensor_factor(velocity, trial.dvl.parameters(), chain, 0, {"state": 1, "bias": 2}, values)
+        sensor_factor(velocity, trial.dvl.parameters(), chain, 0, key_of, values)
 
 
 def test_nodes_that_the_imu_does_not_cover_are_refused():
