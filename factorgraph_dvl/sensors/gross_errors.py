@@ -16,8 +16,11 @@ _RANGE = {"rad": 2.0 * np.pi, "m": 1e4, "m/s": 20.0}
 def gross_errors(error: Array, sigma: Array, rejected: BoolArray, unit: str) -> Array:
     """Return -log of the likelihoods of gross errors, (M, d); zero where there is none.
 
-    One that persists counts once: the next is the same but for the noise of both, or another
-    one, whichever is more likely.
+    Where a row is one measurement, it is wrong or right as a whole, and that counts once.
+
+    One that is none of the last one is uniform over the range of the sensor: the same whatever the
+    noise of the others. One that persists counts once: the next is the same but for the noise of
+    both, or another one, whichever is more likely.
 
     Parameters
     ----------
@@ -30,11 +33,13 @@ def gross_errors(error: Array, sigma: Array, rejected: BoolArray, unit: str) -> 
         Unit of the measurement.
     """
     wrong = np.isfinite(error) & rejected
+    together = wrong.sum(axis=1, keepdims=True) if rejected.shape[1] == 1 else np.ones((1, 1))
     step, spread = steps(error, sigma)
     good, _ = steps(np.where(rejected, 0.0, 1.0) + 0.0 * error, sigma)
     persists = 0.5 * (step / spread) ** 2 + np.log(spread) + 0.5 * np.log(2.0 * np.pi)
     persists = np.where(good == 0.0, persists, np.inf)
-    return np.where(wrong, np.fmin(_cost(unit), persists), 0.0)
+    anew = np.log(_RANGE.get(unit, _RANGE["m"])) - np.log(_SHARE) / np.maximum(together, 1)
+    return np.where(wrong, np.fmin(anew, persists), 0.0)
 
 
 def steps(error: Array, sigma: Array) -> tuple[Array, Array]:
@@ -48,11 +53,3 @@ def steps(error: Array, sigma: Array) -> tuple[Array, Array]:
     step = error - np.take_along_axis(error, before, axis=0)
     spread = np.hypot(sigma, np.take_along_axis(sigma, before, axis=0))
     return np.where(both, step, np.nan), np.where(both, spread, np.nan)
-
-
-def _cost(unit: str) -> float:
-    """Return -log of the likelihood of a gross error that is none of the last one.
-
-    It is uniform over the range of the sensor: the same whatever the noise of the others.
-    """
-    return float(np.log(_RANGE.get(unit, _RANGE["m"]) / _SHARE))

@@ -86,6 +86,35 @@ def robust_weights(
     return found, evaluation
 
 
+def noise_of_the_rest(
+    problem: Problem, evaluation: Evaluation, weights: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Return the factors (d,) of each label on stated noise by what is not rejected.
+
+    Gross errors that were taken for noise made it as large.
+
+    Parameters
+    ----------
+    problem : Problem
+        Weighed with its noise factors.
+    evaluation : Evaluation
+        Where the rest leads.
+    weights : mapping of str to ndarray
+        Weights 0 or 1 by label.
+    """
+    factors = dict(problem.noise_factors)
+    groups = {o.label: i for i, o in enumerate(problem.observations)}
+    own = {label: groups[label] for label in weights if label in factors}
+    residuals = _normalised(problem, evaluation, _used(problem, own), own)
+    for label, i in own.items():
+        good = np.where(weights[label] > 0.0, residuals[label], np.nan)
+        factors[label] = factors[label].copy()
+        for group in map(list, problem.observations[i].noise_groups):
+            level = float(np.sqrt(np.nanmean(good[:, group] ** 2)))
+            factors[label][group] = np.maximum(factors[label][group] * level, LEAST_FACTOR)
+    return factors
+
+
 def _searches(
     problem: Problem, evaluation: Evaluation, groups: Mapping[str, int]
 ) -> dict[str, Truncation]:

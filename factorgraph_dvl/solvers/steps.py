@@ -34,7 +34,7 @@ from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, w
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated, Model
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
-from factorgraph_dvl.solvers.outliers import robust_weights
+from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
 from factorgraph_dvl.statistics.variance_components import (
@@ -233,8 +233,11 @@ class GrossErrors:
             return
         weights, there = found
         if not _same(weights, model.robust_weights):
+            # Where gross errors were taken for noise, only both together lower the objective.
+            factors = noise_of_the_rest(problem, there, weights)
             changed = replace(model, robust_weights=weights)
-            yield Proposal(changed, there.states, there.parameters)
+            for each in (changed, replace(changed, noise_factors=factors)):
+                yield Proposal(each, there.states, there.parameters)
 
 
 class Correlation:
