@@ -371,8 +371,8 @@ def test_a_rejected_measurement_costs_a_gross_error_in_place_of_its_log_sigma():
     weights[3] = 0.0
     problem.robust_weights = {"DVL velocity": weights}
     after = dict(zip(problem.usable, problem.log_sigma(evaluation), strict=True))
-    # Uniform over 20 m/s, one in a hundred, beside the sqrt(2 pi) of all others.
-    expected = 3.0 * (np.log(20.0 / 0.01) - 0.5 * np.log(2.0 * np.pi))
+    # One ping in a hundred, three velocities uniform over 20 m/s, beside the sqrt(2 pi) of all.
+    expected = np.log(20.0**3 / 0.01) - 1.5 * np.log(2.0 * np.pi)
     assert after["DVL velocity"][3] == pytest.approx(expected)
     changed = {label for label in before if np.any(before[label] != after[label])}
     assert changed == {"DVL velocity"}

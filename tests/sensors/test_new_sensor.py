@@ -52,7 +52,7 @@ def with_wheel(tmp_path: Path) -> Path:
         shutil.copy(WHEEL / f"{name}.py", package / part / "wheel.py")
     sensors, instruments = (package / part / "catalogue.py" for part in ("sensors", "simulation"))
     add_line(sensors, "AIDS: tuple", "from factorgraph_dvl.sensors.wheel import Wheel\n")
-    add_line(sensors, "Beacons),\n)\n\n\n", "Wheel, ")
+    add_line(sensors, "Usbl),\n)\n\n\n", "Wheel, ")
     add_line(
         instruments,
         "\n\nclass Instrument",

@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.catalogue import AIDS
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.records import arrays_of
+from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.settings.ranges import out_of_range, range_of
 from factorgraph_dvl.simulation import parse_scenario, simulate
 
@@ -40,6 +41,10 @@ def records() -> dict[type, Any]:
         )
         for kind in (Attitude, Ins)
     ]
+    # Of a transceiver there would have to be a ship.
+    every = dict.fromkeys((n for group in Usbl.optional for n in group), np.full(5, np.nan))
+    fixes = every | dict.fromkeys(("time_s", *Usbl.optional[0]), some)
+    others.append(Usbl.from_columns(Usbl.section_type(), fixes, Usbl.section))
     return {type(r): r for r in (*planar.records, trial.imu, *trial.aids, *others)}
 
 
@@ -60,7 +65,7 @@ def test_records_write_into_nothing_that_they_are_given(kind: Any) -> None:
     for values in arrays.values():
         values.flags.writeable = False
     given_to_record = {**arrays}
-    if "position_std" in given_to_record:
+    if "velocity_std" in given_to_record:
         unknown = np.full((record.time.size, 3), np.nan)
         unknown.flags.writeable = False
         # One array for both, as a caller may well do.
@@ -71,7 +76,7 @@ def test_records_write_into_nothing_that_they_are_given(kind: Any) -> None:
     made.columns()
     for name, values in given_to_record.items():
         np.testing.assert_array_equal(values, before[name])
-    if "position_std" in given_to_record:
+    if "velocity_std" in given_to_record:
         assert np.all(made.position_std == record.settings.position_std_m)
         assert np.all(made.velocity_std == record.settings.velocity_std_m_s)
 
