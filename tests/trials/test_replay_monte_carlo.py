@@ -2,8 +2,8 @@
 
     pytest -m slow tests/trials/test_replay_monte_carlo.py
 
-runs 20 seeds of each scenario, half of them of the first minutes of two grades of the mix, and two of the whole
-of it; FACTORGRAPH_DVL_SEEDS runs another number.
+runs 20 seeds of each scenario, half of them of the first minutes of two grades of the mix, and two
+of the whole of it; FACTORGRAPH_DVL_SEEDS runs another number.
 """
 
 from __future__ import annotations
