@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from factorgraph_dvl.geometry.rotations import exp_so3, inverse_right_jacobian, right_jacobian
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.parameters import Parameter, Relative
 
 # Source of noise of a prior.
 PRIOR = "prior of {}"
@@ -307,7 +307,7 @@ def _add_prior(graph: gtsam.NonlinearFactorGraph, p: Parameter, key: int) -> Non
 
 def _root_of(group: Sequence[Parameter]) -> Array:
     """Return a square root of the prior covariance of parameters in their tangent space, SI."""
-    relative = [p for p in group if p.relative is not None]
+    relative = [p.relative for p in group if p.relative is not None]
     if relative and len(group) > 1:
         return _relative_root(group[: -len(relative)], relative)
     sigma = np.concatenate([p.sigma for p in group])
@@ -330,11 +330,11 @@ def _root_of(group: Sequence[Parameter]) -> Array:
     return np.asarray(to_tangent @ root)
 
 
-def _relative_root(others: Sequence[Parameter], relative: Sequence[Parameter]) -> Array:
+def _relative_root(others: Sequence[Parameter], relative: Sequence[Relative]) -> Array:
     """Return the square root of a group in which some are relative to others: each follows one."""
     root, place = _root_of(others), places(others)
-    own = [max(p.relative.sigma, _FIXED_STD) for p in relative if p.relative is not None]
-    follows = [root[place[p.relative.to]] for p in relative if p.relative is not None]
+    own = [max(each.sigma, _FIXED_STD) for each in relative]
+    follows = [root[place[each.to]] for each in relative]
     below = np.hstack([np.concatenate(follows), np.diag(own)])
     return np.vstack([np.hstack([root, np.zeros((len(root), len(own)))]), below])
 

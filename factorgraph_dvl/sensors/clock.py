@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -99,14 +99,14 @@ class Clock:
         return offset + rate * (time - zero)
 
 
-def on_shared_clocks(parameters: Iterable[Parameter], aids: Iterable[Aid]) -> list[Parameter]:
+def on_shared_clocks(parameters: Iterable[Parameter], aids: Sequence[Aid]) -> list[Parameter]:
     """Return parameters with clocks relative to those that sensors say they are by.
 
     Parameters
     ----------
     parameters : iterable of Parameter
         Parameters of all sensors.
-    aids : iterable of Aid
+    aids : sequence of Aid
         The sensors; the settings of each may name the section of another one as `clock`.
 
     Raises
@@ -114,12 +114,14 @@ def on_shared_clocks(parameters: Iterable[Parameter], aids: Iterable[Aid]) -> li
     ConfigError
         If that sensor has no clock of its own.
     """
+    named = {aid.section: getattr(aid.settings, "clock", "") for aid in aids}
+    if not any(named.values()):
+        return list(parameters)
     out = {p.name: p for p in parameters}
     clocks = {
         aid.section: [p.name for p in aid.parameters() if p.stem.endswith(CLOCK_STEMS)]
         for aid in aids
     }
-    named = {aid.section: getattr(aid.settings, "clock", "") for aid in aids}
     for section, other in named.items():
         if not other:
             continue

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.sensors.attitude import COLUMNS as ATTITUDE_COLUMNS
 from factorgraph_dvl.sensors.attitude import (
     LEAST_STD,
     SCHULER_PERIOD,
@@ -25,6 +26,7 @@ from factorgraph_dvl.sensors.attitude import (
 )
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.gnss import POSITION_COLUMNS, VELOCITY_COLUMNS
 from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -43,9 +45,6 @@ from factorgraph_dvl.sensors.records import (
 )
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
 
-POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
-VELOCITY_COLUMNS = ("vel_e_m_s", "vel_n_m_s", "vel_u_m_s")
-ATTITUDE_COLUMNS = ("roll_deg", "pitch_deg", "heading_deg")
 STD_COLUMNS = (
     *("std_e_m", "std_n_m", "std_u_m"),
     *("vel_std_e_m_s", "vel_std_n_m_s", "vel_std_u_m_s"),

@@ -14,6 +14,8 @@ from factorgraph_dvl.geometry.local_cubics import smoothed_arcs, wave_width
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph, theta_by_rph
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, median, rotate
+from factorgraph_dvl.sensors.attitude import COLUMNS as ATTITUDE_COLUMNS
+from factorgraph_dvl.sensors.gnss import POSITION_COLUMNS
 from factorgraph_dvl.sensors.parameters import ParameterSpec
 from factorgraph_dvl.sensors.protocol import SensorSection
 from factorgraph_dvl.sensors.records import (
@@ -24,9 +26,6 @@ from factorgraph_dvl.sensors.records import (
     stack,
 )
 from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
-
-POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
-ATTITUDE_COLUMNS = ("roll_deg", "pitch_deg", "heading_deg")
 
 # Usual intervals of the record from which on an interval is a gap. Chosen: a cubic through a lost
 # sample or two still follows the roll of a ship.

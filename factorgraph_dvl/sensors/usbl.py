@@ -18,7 +18,13 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray, cross, rotate, sk
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.carried_point import PointPosition
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.gnss import HORIZONTAL_AND_UP, Gnss, GnssSettings
+from factorgraph_dvl.sensors.gnss import (
+    HORIZONTAL_AND_UP,
+    POSITION_COLUMNS,
+    POSITION_STD_COLUMNS,
+    Gnss,
+    GnssSettings,
+)
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,
@@ -40,8 +46,6 @@ from factorgraph_dvl.sensors.records import (
 from factorgraph_dvl.sensors.ship import Ship, ShipMotion, ShipSettings
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Sigma3, Vector3
 
-POSITION_COLUMNS = ("lat_deg", "lon_deg", "height_m")
-STD_COLUMNS = ("std_e_m", "std_n_m", "std_u_m")
 POLAR_COLUMNS = ("range_m", "bearing_deg", "depression_deg")
 CARTESIAN_COLUMNS = ("forward_m", "starboard_m", "down_m")
 AGE = "age_s"
@@ -131,7 +135,7 @@ class Usbl:
     parts: ClassVar[Mapping[str, type[SensorRecord]]] = {"ship": Ship}
     required: ClassVar[tuple[str, ...]] = ("time_s",)
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (
-        *(POSITION_COLUMNS, STD_COLUMNS, POLAR_COLUMNS, CARTESIAN_COLUMNS),
+        *(POSITION_COLUMNS, POSITION_STD_COLUMNS, POLAR_COLUMNS, CARTESIAN_COLUMNS),
         (AGE,),
     )
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
@@ -146,7 +150,9 @@ class Usbl:
             columns = named_columns(names, values)
             check_all_or_none(columns, self.source)
             check_possible(columns, self.source)
-        check_range(named_columns(STD_COLUMNS, self.position_std), 1e-6, 1e6, "m", self.source)
+        check_range(
+            named_columns(POSITION_STD_COLUMNS, self.position_std), 1e-6, 1e6, "m", self.source
+        )
         check_range({"range_m": self.polar[:, 0]}, 0.0, 2e4, "m", self.source)
         check_range({AGE: self.age}, 0.0, 600.0, "s", self.source)
         if self.raw.any() and self.ship is None:
@@ -183,7 +189,7 @@ class Usbl:
         """Return the record as a table."""
         groups = {
             POSITION_COLUMNS: self.geodetic / GEODETIC_SI,
-            STD_COLUMNS: self.position_std,
+            POSITION_STD_COLUMNS: self.position_std,
             POLAR_COLUMNS: self.polar / _POLAR_SI,
             CARTESIAN_COLUMNS: self.cartesian,
         }

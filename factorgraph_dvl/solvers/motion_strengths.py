@@ -24,6 +24,7 @@ from factorgraph_dvl.statistics.marginal_likelihood import (
     by_place,
     constants_of,
     covariance_with_states,
+    every_constant,
     leverage_of,
     log_determinant_gradient,
 )
@@ -162,17 +163,13 @@ def _score(
 ) -> tuple[RestrictedScore, Array, Array]:
     """Return what residuals say of strengths, half the gradient of log det, and P of constants."""
     constants = constants_of(problem)
-    columns = {
-        problem.key(name): np.eye(len(problem.prior_root))[:, own]
-        for name, own in problem.columns.items()
-    }
     shared = list(_rows_of(problem, evaluation, phase, strengths))
     observed = {o.label for o in problem.observations}
     known = {(rows.source, rows.begin) for rows, _, _ in shared if rows.source in observed}
     every = [rows for rows, _, _ in shared]
     every += [r for r in problem.observation_rows(evaluation) if (r.source, r.begin) not in known]
     with_states = covariance_with_states(every, information.given(constants), constants)
-    with_constants = information.covariance_with([columns])
+    with_constants = information.covariance_with([every_constant(problem)])
     covariance = np.zeros((len(problem.prior_root),) * 2)
     for name, own in problem.columns.items():
         covariance[own] = with_constants[problem.key(name)]

@@ -12,7 +12,7 @@ from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, spread
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import Tilt, prior_mean
 from factorgraph_dvl.graph.problem import Problem
@@ -27,7 +27,7 @@ from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.sensors.attitude import Attitude
-from factorgraph_dvl.sensors.clock import on_shared_clocks
+from factorgraph_dvl.sensors.clock import CLOCK_STEMS, on_shared_clocks
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Motion, Observation
@@ -386,7 +386,7 @@ def _parameters(trial: Trial) -> tuple[Parameter, ...]:
     out = []
     for aid in trial.aids:
         for p in aid.parameters():
-            reference = aid.section == section and p.stem.endswith(("time_offset", "clock_rate"))
+            reference = aid.section == section and p.stem.endswith(CLOCK_STEMS)
             out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
     return tuple(on_shared_clocks(out, trial.aids))
 
@@ -459,9 +459,9 @@ def _without_gross_errors(time: Array, velocity: Array, locked: Array, track: Tr
     if known.size < _FEWEST:
         return np.asarray(np.flatnonzero(locked))
     off = np.linalg.norm(velocity[known], axis=1) - np.linalg.norm(v_n[known], axis=1)
-    off = np.abs(off - np.median(off))
-    gate = max(_FAR_OFF * 1.4826 * float(np.median(off)), _FAR_OFF_M_S)
-    return np.asarray(known[off < gate])
+    off -= np.median(off)
+    gate = max(_FAR_OFF * float(spread(off)), _FAR_OFF_M_S)
+    return np.asarray(known[np.abs(off) < gate])
 
 
 def node_clock(trial: Trial, frame: LocalFrame) -> str:

@@ -187,8 +187,7 @@ def log_determinant_gradient(
     out = np.zeros(len(problem.prior_root))
     if not constants:
         return out
-    every = {problem.key(name): np.eye(out.size)[:, own] for name, own in problem.columns.items()}
-    sigma = np.sqrt(np.diag(information.covariance_of([every])))
+    sigma = np.sqrt(np.diag(information.covariance_of([every_constant(problem)])))
     steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
     if with_states is None:
         all_rows = list(problem.observation_rows(evaluation))
@@ -225,6 +224,12 @@ def log_determinant_gradient(
 def constants_of(problem: Problem) -> set[int]:
     """Return the keys of the constants."""
     return {problem.key(p.name) for p in problem.parameters}
+
+
+def every_constant(problem: Problem) -> dict[int, Array]:
+    """Return the functional (P, size) by key that is all estimated parameters side by side."""
+    one = np.eye(len(problem.prior_root))
+    return {problem.key(name): one[:, own] for name, own in problem.columns.items()}
 
 
 def _states_of(rows: Rows, constants: set[int]) -> int:
