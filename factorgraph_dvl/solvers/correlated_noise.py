@@ -37,6 +37,9 @@ _CONSTANT = 100.0
 # Standard deviations of a sample variance by which residuals must show less noise than is stated.
 # Chosen: a few in a thousand records are taken for what they are not.
 _SURE = 3.0
+# More nodes that a process gets where its strength asks for more. Chosen: what interpolation
+# between its nodes leaves out is at most twice what white noise leaves of a mean.
+_CLOSER = 1.4
 # Measurements, s, below which correlation is not searched. Chosen: trials with rival minima, whose
 # costs compare only under one model, last up to 30 s.
 _SHORTEST = 29.0
@@ -91,9 +94,7 @@ def correlated_noise(
         if not o.noise_groups or used.any(axis=1).sum() < 2:
             continue
         sigma = _typical(weight)
-        # Nodes reach as far as the outliers too: those may be used later.
-        outlier = problem.robust_weights.get(o.label, np.ones(1)) == 0.0
-        when = o.time[(used | outlier).any(axis=1)]
+        when = _used_time(problem, i)
         stated = o.correlated
         process = None
         if stated is not None and stated.sigma is not None:
@@ -167,6 +168,13 @@ def _lack(shown: float, count: int) -> float:
     """Return which share of a deviation a variance lacks that so many residuals show of it."""
     lack = 1.0 - shown
     return float(np.sqrt(lack)) if count and lack > _SURE * np.sqrt(2.0 / count) else 0.0
+
+
+def _used_time(problem: Problem, i: int) -> Array:
+    """Return when an observation is used, s; outliers may be used later, and count."""
+    o = problem.observations[i]
+    outlier = problem.robust_weights.get(o.label, np.ones(1)) == 0.0
+    return np.asarray(o.time[((problem.weights[i] > 0.0) | outlier).any(axis=1)])
 
 
 def unseen_offsets(problem: Problem) -> dict[str, Array]:
@@ -325,6 +333,35 @@ def with_innovations(process: Process, factor: Array) -> Process:
         longest = _CONSTANT * float(np.ptp(process.time))
         return replace(process, tau=np.clip(process.tau / factor**2, _LEAST_TIME, longest))
     return replace(process, sigma=process.sigma * factor)
+
+
+def with_closer_nodes(process: Process, problem: Problem, change: Mapping[str, Array]) -> Process:
+    """Return a process with the nodes that its strength asks for, where these are far more.
+
+    Parameters
+    ----------
+    process : Process
+        Its deviation and time were found anew.
+    problem : Problem
+        What it is a process of.
+    change : mapping of str to ndarray
+        Factors (d,) on the white noise of each label, relative to what is applied.
+    """
+    active = process.sigma > 0.0
+    labels = [o.label for o in problem.observations]
+    if process.label not in labels or not active.any():
+        return process
+    i = labels.index(process.label)
+    white = _typical(problem.weights[i]) * change.get(process.label, np.ones(active.size))
+    nodes = node_times(
+        _used_time(problem, i),
+        float(process.tau[active].min()),
+        process.sigma[active],
+        white[active],
+    )
+    if nodes.size < _CLOSER * process.time.size:
+        return process
+    return replace(process, time=nodes)
 
 
 def long_run_share(problem: Problem, process: Process) -> Array:

@@ -26,6 +26,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     long_run_share,
     noise_of,
+    with_closer_nodes,
     with_innovations,
     with_others,
 )
@@ -93,6 +94,19 @@ class Step(Protocol):
 def _from(at: Estimated, **changes: Any) -> Proposal:
     """Return a proposal that starts where a minimum is."""
     return Proposal(replace(at.model, **changes), at.states, at.values)
+
+
+def _with_processes(at: Estimated, processes: tuple[Process, ...], **changes: Any) -> Proposal:
+    """Return a proposal with processes that have as many nodes as before, or more."""
+    moved = [
+        (p, q) for p, q in zip(at.model.processes, processes, strict=True) if p.time is not q.time
+    ]
+    values, reference = (
+        each | {q.name: q.nodes_of(p, each[p.name]) for p, q in moved if p.name in each}
+        for each in (at.values, at.model.reference[1])
+    )
+    changes["reference"] = (at.model.reference[0], reference)
+    return Proposal(replace(at.model, processes=processes, **changes), at.states, values)
 
 
 class _Asked:
@@ -361,7 +375,12 @@ class Noise:
             )
             if _same(changed, before) and _are_those(part, model.processes):
                 return
-            yield _from(at, noise_factors=changed, processes=part)
+            change = {label: f / before[label] for label, f in changed.items()}
+            yield _with_processes(
+                at,
+                tuple(with_closer_nodes(p, problem, change) for p in part),
+                noise_factors=changed,
+            )
 
 
 class ImuNoise:
