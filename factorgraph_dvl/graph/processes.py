@@ -49,8 +49,9 @@ class Process:
         Correlation time of each component.
     time : ndarray, shape (J,), s
         Times of the nodes.
-    density_only : bool, default False
-        Whether only the density 2 sigma² / tau can be estimated, and sigma is as stated.
+    least_sigma : ndarray, shape (n,), optional
+        Deviation that each component has at least, where the record is too short to show more of
+        it than its density 2 sigma² / tau.
     walk : ScaleWalk, optional
         Random walk of the scale, which is the last component of the nodes.
     parameter : str, optional
@@ -66,11 +67,16 @@ class Process:
     sigma: Array
     tau: Array
     time: Array
-    density_only: bool = False
+    least_sigma: Array | None = None
     walk: ScaleWalk | None = None
     parameter: str | None = None
     free: bool = False
     goes_on: bool = False
+
+    @property
+    def density_only(self) -> bool:
+        """Whether only the density is sure, and the deviation is as stated, or larger."""
+        return self.least_sigma is not None
 
     def going_on(self, time: Array, walk: ScaleWalk | None) -> Process:
         """Return it at other nodes, of which the first was among its own.

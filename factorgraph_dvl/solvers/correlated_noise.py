@@ -30,10 +30,6 @@ _START_TIME = 4.0
 # Correlation times in a trial below which only the density 2 σ² / τ can be
 # estimated. Measured: σ alone is then uncertain by a factor.
 _MANY = 20.0
-# Correlation time, s, that the stated deviation has at least. Chosen: with less it is white.
-_LEAST_TIME = 4.0
-# Trials that a correlation time lasts, at most. Chosen: the process is then a constant.
-_CONSTANT = 100.0
 # Standard deviations of a sample variance by which residuals must show less noise than is stated.
 # Chosen: a few in a thousand records are taken for what they are not.
 _SURE = 3.0
@@ -101,7 +97,8 @@ def correlated_noise(
             tau = np.full(sigma.size, stated.time)
             nodes = node_times(when, stated.time, stated.sigma, sigma)
             short = float(np.ptp(when)) < _MANY * stated.time
-            process = Process(o.label, len(processes), stated.sigma, tau, nodes, short)
+            least = stated.sigma if short else None
+            process = Process(o.label, len(processes), stated.sigma, tau, nodes, least)
         elif o.label in estimated and np.ptp(when) >= _SHORTEST:
             residuals = np.where(used, evaluation.residuals[i], np.nan)
             found = _fits(o, residuals)
@@ -211,7 +208,7 @@ def _with_unseen(
         tau = np.where(own, tau, process.tau)
     active = missing > 0.0
     nodes = node_times(time, float(tau[active].min()), missing[active], sigma[active])
-    return Process(o.label, index, missing, tau, nodes, density_only=True)
+    return Process(o.label, index, missing, tau, nodes, least_sigma=missing)
 
 
 def _walking(
@@ -315,7 +312,8 @@ def _model(
     nodes = node_times(
         time, float(tau[active].min()), process_sigma[active], (sigma * white)[active]
     )
-    process = Process(o.label, index, process_sigma, tau, nodes, density_only)
+    least = process_sigma if density_only else None
+    process = Process(o.label, index, process_sigma, tau, nodes, least)
     return process, white, inflation
 
 
@@ -325,14 +323,6 @@ def with_others(before: Sequence[Process], found: Sequence[Process]) -> tuple[Pr
     free = (i for i in range(len(before) + len(found)) if i not in {p.index for p in before})
     others = (p for p in found if p.label not in known)
     return (*before, *(replace(p, index=i) for p, i in zip(others, free, strict=False)))
-
-
-def with_innovations(process: Process, factor: Array) -> Process:
-    """Return a process whose innovations are larger by a factor (d,) than assumed."""
-    if process.density_only:
-        longest = _CONSTANT * float(np.ptp(process.time))
-        return replace(process, tau=np.clip(process.tau / factor**2, _LEAST_TIME, longest))
-    return replace(process, sigma=process.sigma * factor)
 
 
 def with_closer_nodes(process: Process, problem: Problem, change: Mapping[str, Array]) -> Process:
@@ -362,16 +352,6 @@ def with_closer_nodes(process: Process, problem: Problem, change: Mapping[str, A
     if nodes.size < _CLOSER * process.time.size:
         return process
     return replace(process, time=nodes)
-
-
-def long_run_share(problem: Problem, process: Process) -> Array:
-    """Return the share (d,) of a process in the variance of a sensor's mean over a long time."""
-    (i,) = (i for i, o in enumerate(problem.observations) if o.label == process.label)
-    interval = float(np.median(np.diff(problem.observations[i].time)))
-    correlated = 2.0 * process.sigma**2 * process.tau
-    white = _typical(problem.weights[i]) ** 2 * interval
-    total = correlated + white
-    return np.divide(correlated, total, out=np.zeros(total.size), where=total > 0.0)
 
 
 def noise_of(problem: Problem) -> tuple[Noise, ...]:

@@ -32,8 +32,8 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
 
     By expectation and maximisation (Shumway and Stoffer, An approach to time series smoothing
     and forecasting using the EM algorithm, Journal of Time Series Analysis 3(4), 1982) with
-    steps extrapolated; the motion is linearised where it is. Processes of which only the density
-    is known, and those that the trial states, stay as they are.
+    steps extrapolated; the motion is linearised where it is. Where a record is too short to show
+    more than a density, deviations stay above the least, and times follow the density.
 
     Parameters
     ----------
@@ -43,10 +43,7 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
         Its minimum.
     """
     before = problem.processes
-    free = [
-        not p.density_only and p.label in problem.noise_factors and bool(p.sigma.any())
-        for p in before
-    ]
+    free = [p.label in problem.noise_factors and bool(p.sigma.any()) for p in before]
     if not any(free):
         return before
     parameters = dict(evaluation.parameters)
@@ -116,10 +113,18 @@ def _extrapolated(step: Array, before: Array | None) -> Array:
 
 def _moved(process: Process, step: Array) -> Process:
     """Return a process after a step of the logarithms."""
-    step = np.clip(step, -_LARGEST, _LARGEST)
-    span = float(np.ptp(process.time))
+    sigma, tau = np.exp(step)
+    sigma, tau = process.sigma * sigma, process.tau * tau
+    if process.least_sigma is None:
+        tau = np.minimum(tau, float(np.ptp(process.time)))
+    else:
+        known = np.where(sigma > 0.0, sigma, 1.0)
+        short = np.maximum(np.where(sigma > 0.0, process.least_sigma, 1.0) / known, 1.0)
+        sigma, tau = sigma * short, tau * short**2
+    ratio = np.divide(sigma, process.sigma, out=np.ones(sigma.size), where=sigma > 0.0)
+    most = np.exp(_LARGEST)
     return replace(
         process,
-        sigma=process.sigma * np.exp(step[0]),
-        tau=np.minimum(process.tau * np.exp(step[1]), span),
+        sigma=process.sigma * np.clip(ratio, 1.0 / most, most),
+        tau=process.tau * np.clip(tau / process.tau, 1.0 / most, most),
     )

@@ -24,10 +24,8 @@ from factorgraph_dvl.solvers.bias_walks import bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
-    long_run_share,
     noise_of,
     with_closer_nodes,
-    with_innovations,
     with_others,
 )
 from factorgraph_dvl.solvers.imu_noise import lower_noise
@@ -39,7 +37,6 @@ from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
 from factorgraph_dvl.statistics.variance_components import (
-    VarianceComponents,
     variance_components,
 )
 
@@ -50,9 +47,6 @@ _FURTHER = 3.0
 # Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
 # the model is wrong.
 _MOST_FREED = 2
-# Relative change of the noise over a long time, by that of innovations, from which on it counts.
-# Chosen: less changes no σ that is shown.
-_SAME_INNOVATIONS = 0.05
 # Variance of the scores, beside that of white noise, that a change may leave to explain what looks
 # like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
 _MOST_SCATTER = 20.0
@@ -352,22 +346,25 @@ class Noise:
 
     name = "noise"
 
+    def __init__(self) -> None:
+        # Objective from which it last asked.
+        self._asked_at = np.inf
+
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what residuals ask for, then part of it."""
         model, problem, minimum = at.model, at.problem, at.minimum
         if not model.noise_factors or not minimum.converged or problem.chain.interpolates:
+            return
+        gained, self._asked_at = self._asked_at - at.objective, at.objective
+        if 0.0 < gained < LEAST_GAIN:
+            # Estimates of strengths fall by a part of what is left each time.
             return
         found = variance_components(problem, minimum.evaluation, minimum.information)
         before = model.noise_factors
         factors = dict(before) | {
             label: f.after(before[label]) for label, f in found.white.items()
         }
-        processes = tuple(
-            with_innovations(p, found.correlated[p.label].factor)
-            if p.density_only and p.label in found.correlated and _counts(problem, found, p)
-            else p
-            for p in refitted(problem, minimum.evaluation)
-        )
+        processes = refitted(problem, minimum.evaluation)
         for share in _SHARES:
             changed = _part_of(before, factors, share)
             part = tuple(
@@ -491,12 +488,6 @@ def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bo
 def _misfit(problem: Problem) -> bool:
     """Whether the noise of a sensor is far more than anyone would state."""
     return any(np.max(noise.factor) > DO_NOT_FIT for noise in noise_of(problem))
-
-
-def _counts(problem: Problem, found: VarianceComponents, process: Process) -> bool:
-    """Whether other innovations change the noise over a long time."""
-    change = np.log(found.correlated[process.label].factor)
-    return bool(np.abs(long_run_share(problem, process) * change).max() > _SAME_INNOVATIONS)
 
 
 def _same(a: Mapping[str, Array], b: Mapping[str, Array]) -> bool:
