@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 import pytest
 from truth import scenario
 
+from factorgraph_dvl.graph.processes import Activity, Process
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.simulation.faults import gauss_markov
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.solvers.process_fit import following, refitted
 
 LEGS = [
     {"straight_s": 30},
@@ -81,13 +82,65 @@ def test_no_other_deviation_or_time_is_more_likely(solved):
             assert log_likelihood(problem, evaluation, other) < best
 
 
-def test_what_is_stated_stays(solved):
+def test_noise_that_is_not_estimated_stays(solved):
     problem, evaluation = solved
     (process,) = problem.processes
-    problem.processes = (replace(process, density_only=True),)
-    assert refitted(problem, evaluation)[0] is problem.processes[0]
-    problem.processes = (process,)
     factors = problem.noise_factors
     problem.noise_factors = {}
     assert refitted(problem, evaluation)[0] is process
     problem.noise_factors = factors
+
+
+@pytest.mark.parametrize("factor", [3.0, 0.3])
+def test_a_deviation_is_never_below_the_least_and_keeps_its_density(solved, factor):
+    problem, evaluation = solved
+    (process,) = problem.processes
+    (free,) = refitted(problem, evaluation)
+    least = process.sigma * factor
+    start = replace(process, sigma=least, tau=process.tau * factor**2, least_sigma=least)
+    problem.processes = (start,)
+    nodes = evaluation.parameters[process.name] / factor
+    (found,) = refitted(
+        problem, replace(evaluation, parameters=evaluation.parameters | {process.name: nodes})
+    )
+    problem.processes = (process,)
+    active = process.sigma > 0.0
+    assert np.all(found.sigma[active] >= factor * process.sigma[active] * (1.0 - 1e-12))
+    if factor < 1.0:
+        # Where the data show more, it is as if nothing was stated.
+        assert found.sigma[active] == pytest.approx(free.sigma[active], rel=0.1)
+    density = [(p.sigma**2 / p.tau)[active] for p in (found, free)]
+    assert density[0] == pytest.approx(density[1], rel=0.5)
+
+
+def test_innovations_that_follow_an_activity_are_found():
+    """Draw nodes that are known; their innovations have 0.9 of their variance in bursts."""
+    rng = np.random.default_rng(4)
+    time = np.arange(4001.0)
+    square = np.where(rng.random(4000) < 0.1, 1.0, 0.0)
+    process = Process("a", 0, np.array([2.0]), np.array([20.0]), time)
+    truth = replace(Activity.of(time, square, 1), share=np.array([0.9]))
+    phi = np.exp(-1.0 / 20.0)
+    sigma = np.sqrt((1.0 - phi**2) * truth.variance(time)[:, 0])
+    nodes = np.zeros((4001, 1))
+    for j in range(4000):
+        nodes[j + 1] = phi * nodes[j] + sigma[j] * rng.normal()
+
+    found, gain = following(process, Activity.of(time, square, 1), nodes, Known(1))
+    assert found.activity.share == pytest.approx([0.9], abs=0.02)
+    assert gain > 1000.0
+    even = phi ** np.arange(4001)[:, None] * 0.0
+    for j in range(4000):
+        even[j + 1] = phi * even[j] + np.sqrt(1.0 - phi**2) * rng.normal()
+    _, gain = following(process, Activity.of(time, square, 1), even, Known(1))
+    assert gain < 9.0
+
+
+@dataclass(frozen=True)
+class Known:
+    """Information of nodes that are known."""
+
+    size: int
+
+    def joint_covariances(self, pairs):
+        return np.zeros((len(pairs), 2 * self.size, 2 * self.size))
