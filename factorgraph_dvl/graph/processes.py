@@ -32,43 +32,6 @@ _LAST = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Activity:
-    """How far the innovations of an error follow what happens, as a square of accelerations.
-
-    Their variance between two nodes is that of a process whose innovations are alike, times
-
-        1 - share + share mean(activity between them) / mean(activity)
-
-    Parameters
-    ----------
-    time : ndarray, shape (K,), s
-        Times over which the activity is known.
-    total : ndarray, shape (K,), s
-        Its integral, relative to its mean: it grows as the time does, all in all.
-    share : ndarray, shape (n,)
-        For each component of the error, from 0 to below 1.
-    """
-
-    time: Array
-    total: Array
-    share: Array
-
-    @classmethod
-    def of(cls, time: Array, square: Array, size: int) -> Activity:
-        """Return that of squares (K - 1,) between times (K,), which no component follows."""
-        total = np.append(0.0, np.cumsum(square * np.diff(time)))
-        return cls(time, total * float(np.ptp(time)) / total[-1], np.zeros(size))
-
-    def between(self, nodes: Array) -> Array:
-        """Return the activity between nodes at times (J,), relative to its mean, (J - 1,)."""
-        return np.asarray(np.diff(np.interp(nodes, self.time, self.total)) / np.diff(nodes))
-
-    def variance(self, nodes: Array) -> Array:
-        """Return the factor on the variance of innovations, (J - 1, n)."""
-        return 1.0 - self.share + self.share * self.between(nodes)[:, None]
-
-
-@dataclass(frozen=True, eq=False)
 class Process:
     """A correlated error that adds to the components of an observation, or to a parameter.
 
@@ -89,8 +52,6 @@ class Process:
     least_sigma : ndarray, shape (n,), optional
         Deviation that each component has at least, where the record is too short to show more of
         it than its density 2 sigma² / tau.
-    activity : Activity, optional
-        What its innovations follow; by default they are alike.
     walk : ScaleWalk, optional
         Random walk of the scale, which is the last component of the nodes.
     parameter : str, optional
@@ -107,7 +68,6 @@ class Process:
     tau: Array
     time: Array
     least_sigma: Array | None = None
-    activity: Activity | None = None
     walk: ScaleWalk | None = None
     parameter: str | None = None
     free: bool = False
@@ -251,18 +211,9 @@ class Process:
         return out
 
     @property
-    def innovations(self) -> Array:
-        """Factor on the variance of each innovation by what it follows, (J - 1, n)."""
-        if self.activity is None:
-            return np.ones((self.time.size - 1, self.sigma.size))
-        return self.activity.variance(self.time)
-
-    @property
     def _weight(self) -> Array:
         """Inverse standard deviations of the innovations, (J - 1, size)."""
-        variance = -np.expm1(-2.0 * np.diff(self.time)[:, None] / self._of_nodes[1])
-        variance[:, : self.sigma.size] *= self.innovations
-        return 1.0 / np.sqrt(variance)
+        return 1.0 / np.sqrt(-np.expm1(-2.0 * np.diff(self.time)[:, None] / self._of_nodes[1]))
 
     @property
     def log_determinant(self) -> float:

@@ -32,7 +32,7 @@ _START_TIME = 4.0
 _MANY = 20.0
 # Standard deviations of a sample variance by which residuals must show less noise than is stated.
 # Chosen: a few in a thousand records are taken for what they are not.
-SURE = 3.0
+_SURE = 3.0
 # More nodes that a process gets where its strength asks for more. Chosen: what interpolation
 # between its nodes leaves out is at most twice what white noise leaves of a mean.
 _CLOSER = 1.4
@@ -164,7 +164,7 @@ def _unseen(
 def _lack(shown: float, count: int) -> float:
     """Return which share of a deviation a variance lacks that so many residuals show of it."""
     lack = 1.0 - shown
-    return float(np.sqrt(lack)) if count and lack > SURE * np.sqrt(2.0 / count) else 0.0
+    return float(np.sqrt(lack)) if count and lack > _SURE * np.sqrt(2.0 / count) else 0.0
 
 
 def _used_time(problem: Problem, i: int) -> Array:

@@ -26,9 +26,11 @@ CONVERGED = 1e-5
 # The same below which the next step is for QR to prove, and small if the cost falls as promised.
 # Chosen: 0.014 σ.
 _NEARLY = 1e-4
-# The same up to which a minimum is reached where no step lowers the cost: 0.05 σ, which nothing
-# that is reported shows.
-_WITHIN = 0.5 * 0.05**2
+# Move of a constant up to which a minimum is reached where no step lowers the cost, in standard
+# deviations, which nothing that is reported shows; and promised decrease, all together. Chosen.
+_SAME = 0.05
+_WITHIN = 0.5 * _SAME**2
+_LITTLE = 0.005
 # The same from which on the next step is from QR at once: it may be the last. Chosen: 0.14 σ.
 _NEAR = 1e-2
 # Sizes of a step that the linear model is trusted for, once it has failed: NavState
@@ -226,7 +228,7 @@ def minimise(
         elif promised < _WITHIN and damping == 0.0 and held:
             settled = True
             break
-        elif promised < _WITHIN and damping == 0.0 and (root is not None or not proven):
+        elif damping == 0.0 and _within(problem, promised, root, delta, proven=proven):
             return Minimum(evaluation, root, True, iteration)
         elif not careful and root is None:
             # The step may have been bad for want of digits only.
@@ -238,8 +240,28 @@ def minimise(
                 break
         root = None
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
-    promised = _promised(problem, evaluation, gaussian, root.solution())
-    return Minimum(evaluation, root, promised < _WITHIN or settled, iteration)
+    delta = root.solution()
+    promised = _promised(problem, evaluation, gaussian, delta)
+    settled = settled or _within(problem, promised, root, delta, proven=True)
+    return Minimum(evaluation, root, settled, iteration)
+
+
+def _within(
+    problem: Problem,
+    promised: float,
+    root: SquareRootInformation | None,
+    delta: gtsam.VectorValues,
+    *,
+    proven: bool,
+) -> bool:
+    """Whether a step promises hardly anything, and would move no constant that is reported."""
+    if root is None:
+        return promised < _WITHIN and not proven
+    if promised < _WITHIN or promised > _LITTLE or not problem.parameters:
+        return promised < _WITHIN
+    step = np.concatenate([delta.at(problem.key(name)) for name in problem.columns])
+    variance = np.diag(root.covariance_of([every_constant(problem)]))
+    return bool(np.all(np.abs(step) < _SAME * np.sqrt(variance)))
 
 
 def _promised(

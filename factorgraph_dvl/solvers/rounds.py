@@ -28,7 +28,6 @@ from factorgraph_dvl.solvers.preparation import Prepared
 from factorgraph_dvl.solvers.steps import (
     Averaging,
     Correlation,
-    Following,
     Gates,
     GrossErrors,
     ImuNoise,
@@ -109,7 +108,7 @@ def settle(
     walks = Walks(report, known)
     steps: list[Step] = [
         MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,
-        Noise(), ImuNoise(), Following(), Uncorrelated(), walks,
+        Noise(), ImuNoise(), Uncorrelated(), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:

@@ -14,7 +14,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.graph.processes import Activity, Process
+from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import DO_NOT_FIT
@@ -23,7 +23,6 @@ from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.correlated_noise import (
-    SURE,
     correlated_noise,
     noise_of,
     with_closer_nodes,
@@ -36,7 +35,7 @@ from factorgraph_dvl.solvers.model import Estimated, Model
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
-from factorgraph_dvl.solvers.process_fit import following, refitted
+from factorgraph_dvl.solvers.process_fit import refitted
 from factorgraph_dvl.statistics.variance_components import (
     variance_components,
 )
@@ -283,41 +282,6 @@ class Correlation:
         )
 
 
-class Following:
-    """Noise that persists: whether it changes where the vehicle accelerates.
-
-    So do the errors of what is filtered, as by an INS or a receiver: it is late where the motion
-    is not what its filter expects.
-    """
-
-    name = "noise that follows the motion"
-
-    def __init__(self) -> None:
-        self._asked = _Asked()
-
-    def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield processes whose innovations follow the square of the acceleration."""
-        model, problem, minimum = at.model, at.problem, at.minimum
-        own = model.prepared, _labels(model)
-        if self._asked.before(*own) or not minimum.converged or problem.chain.interpolates:
-            return
-        self._asked.note(*own)
-        when, v_n = problem.chain.node_time, minimum.evaluation.states.v_n
-        square = np.sum((np.diff(v_n, axis=0) / np.diff(when)[:, None]) ** 2, axis=1)
-        if not square.any():
-            return
-        processes = list(model.processes)
-        for i, p in enumerate(processes):
-            if p.activity is None and p.label in model.noise_factors and p.sigma.any():
-                activity = Activity.of(when, square, p.sigma.size)
-                nodes = minimum.evaluation.parameters[p.name]
-                found, gain = following(p, activity, nodes, minimum.information)
-                if gain > SURE**2:
-                    processes[i] = found
-        if not _are_those(tuple(processes), model.processes):
-            yield _from(at, processes=tuple(processes))
-
-
 class Uncorrelated:
     """Noise that was found to persist: whether it still does, as other noise is known better."""
 
@@ -504,7 +468,7 @@ def _between(before: Process, after: Process, share: float) -> Process:
     active = before.sigma > 0.0
     ratio = np.divide(after.sigma, before.sigma, out=np.ones(active.size), where=active)
     return replace(
-        after,
+        before,
         sigma=before.sigma * ratio**share,
         tau=before.tau * (after.tau / before.tau) ** share,
     )

@@ -14,7 +14,7 @@ from truth import scenario
 
 from factorgraph_dvl.graph import inertial_chain, keys
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.graph.processes import Activity, Process, node_times
+from factorgraph_dvl.graph.processes import Process, node_times
 from factorgraph_dvl.sensors.protocol import ScaleWalk
 from factorgraph_dvl.simulation import simulate
 
@@ -243,28 +243,6 @@ def test_branches_of_states_and_processes_are_joined_by_what_goes_last(walks, la
     ]
     assert all(len(each) <= 1 for each in states)
     assert set().union(*states) == set(range(-(-(time.size - 1) // 10)))
-
-
-def test_an_activity_is_relative_to_its_mean_by_hand():
-    # Squares 1 for 2 s and 4 for 1 s: their mean is 2.
-    activity = Activity.of(np.array([0.0, 2.0, 3.0]), np.array([1.0, 4.0]), 1)
-    np.testing.assert_allclose(activity.between(np.array([0.0, 2.0, 3.0])), [0.5, 2.0])
-    # Half of the first second, and the mean of both around 2 s.
-    np.testing.assert_allclose(activity.between(np.array([1.5, 2.5])), [1.25])
-    followed = replace(activity, share=np.array([0.5]))
-    np.testing.assert_allclose(followed.variance(np.array([0.0, 2.0, 3.0])), [[0.75], [1.5]])
-
-
-def test_innovations_are_wider_where_they_follow_what_happens():
-    time = np.array([0.0, 2.0, 3.0])
-    activity = replace(Activity.of(time, np.array([1.0, 4.0]), 1), share=np.array([1.0]))
-    alike = Process("a", 0, np.array([1.0]), np.array([5.0]), time)
-    follows = replace(alike, activity=activity)
-    nodes = np.array([[0.3], [-0.2], [0.8]])
-    expected = alike.prior_residuals(nodes) / np.sqrt([[1.0], [0.5], [2.0]])
-    np.testing.assert_allclose(follows.prior_residuals(nodes), expected)
-    difference = follows.log_determinant - alike.log_determinant
-    assert difference == pytest.approx(np.log(0.5) + np.log(2.0))
 
 
 def test_other_nodes_have_the_same_errors():

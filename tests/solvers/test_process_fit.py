@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 from truth import scenario
 
-from factorgraph_dvl.graph.processes import Activity, Process
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.simulation.faults import gauss_markov
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.process_fit import following, refitted
+from factorgraph_dvl.solvers.process_fit import refitted
 
 LEGS = [
     {"straight_s": 30},
@@ -111,36 +110,3 @@ def test_a_deviation_is_never_below_the_least_and_keeps_its_density(solved, fact
         assert found.sigma[active] == pytest.approx(free.sigma[active], rel=0.1)
     density = [(p.sigma**2 / p.tau)[active] for p in (found, free)]
     assert density[0] == pytest.approx(density[1], rel=0.5)
-
-
-def test_innovations_that_follow_an_activity_are_found():
-    """Draw nodes that are known; their innovations have 0.9 of their variance in bursts."""
-    rng = np.random.default_rng(4)
-    time = np.arange(4001.0)
-    square = np.where(rng.random(4000) < 0.1, 1.0, 0.0)
-    process = Process("a", 0, np.array([2.0]), np.array([20.0]), time)
-    truth = replace(Activity.of(time, square, 1), share=np.array([0.9]))
-    phi = np.exp(-1.0 / 20.0)
-    sigma = np.sqrt((1.0 - phi**2) * truth.variance(time)[:, 0])
-    nodes = np.zeros((4001, 1))
-    for j in range(4000):
-        nodes[j + 1] = phi * nodes[j] + sigma[j] * rng.normal()
-
-    found, gain = following(process, Activity.of(time, square, 1), nodes, Known(1))
-    assert found.activity.share == pytest.approx([0.9], abs=0.02)
-    assert gain > 1000.0
-    even = phi ** np.arange(4001)[:, None] * 0.0
-    for j in range(4000):
-        even[j + 1] = phi * even[j] + np.sqrt(1.0 - phi**2) * rng.normal()
-    _, gain = following(process, Activity.of(time, square, 1), even, Known(1))
-    assert gain < 9.0
-
-
-@dataclass(frozen=True)
-class Known:
-    """Information of nodes that are known."""
-
-    size: int
-
-    def joint_covariances(self, pairs):
-        return np.zeros((len(pairs), 2 * self.size, 2 * self.size))
