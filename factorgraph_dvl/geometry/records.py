@@ -33,4 +33,6 @@ def concatenated(parts: Sequence[_Arrays]) -> _Arrays:
 
 
 def _joined(parts: Sequence[Any]) -> Any:
+    if parts[0] is None:
+        return None
     return np.concatenate(parts) if isinstance(parts[0], np.ndarray) else concatenated(parts)

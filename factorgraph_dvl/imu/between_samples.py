@@ -29,13 +29,20 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
     # Rotation vectors turn by Jr^-1(phi) rate.
     rate_after = rate_after + 0.5 * across + cross(phi, across) / 12.0
     force_after = rotate(exp_so3(phi), force_after)
-    phi_at = _cubic(values, phi, rate, rate_after)
+    phi_at, dv_at = _cubic(values, phi, rate, rate_after), _cubic(values, dv, force, force_after)
+    moved = 0.5 * dv * dt[:, None], np.zeros_like(dv), dv
+    turning = _cubic(slopes, phi, rate, rate_after)
+    across = cross(phi_at, turning)
+    turning = turning - 0.5 * across + cross(phi_at, across) / 6.0
+    signals = inc.rate_at(index, since)
     return Partial(
         phi=phi_at,
-        dv=_cubic(values, dv, force, force_after),
-        dp=_cubic(values, 0.5 * dv * dt[:, None], np.zeros_like(dv), dv),
+        dv=dv_at,
+        dp=_cubic(values, *moved),
         force=rotate(exp_so3(-phi_at), _cubic(slopes, dv, force, force_after)),
-        **inc.rate_at(index, since),
+        vibration=turning - signals["omega"],
+        moving=_cubic(slopes, *moved) - dv_at,
+        **signals,
     )
 
 

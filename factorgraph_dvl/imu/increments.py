@@ -65,6 +65,9 @@ class Partial:
         rad/s.
     alpha_sigma, force_sigma : ndarray, shape (M,)
         Standard deviation of alpha and force from noise.
+    vibration, moving : ndarray, shape (M, 3), optional
+        By how much attitude and position change faster at the end than omega and dv say, rad/s and
+        m/s: the rate is smoothed, and the increments are those of the samples.
     """
 
     phi: Array
@@ -76,6 +79,8 @@ class Partial:
     omega_sigma: Array
     alpha_sigma: Array
     force_sigma: Array
+    vibration: Array | None = None
+    moving: Array | None = None
 
 
 @dataclass(frozen=True)

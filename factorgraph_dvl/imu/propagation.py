@@ -65,6 +65,9 @@ class Attachment:
         Standard deviation of alpha and force from noise.
     turn : ndarray, shape (M, 3, 3)
         Exp(-earth_rate tau).
+    vibration, moving : ndarray, shape (M, 3), optional
+        By how much attitude and position change faster than gyro and dV say, rad/s in the axes at
+        the time, and m/s in those at the node.
     """
 
     segment: IntArray
@@ -81,6 +84,8 @@ class Attachment:
     alpha_sigma: Array
     force_sigma: Array
     turn: Array
+    vibration: Array | None = None
+    moving: Array | None = None
 
 
 def attach(seg: Segments, time: Array, earth_rate_n: Array, *, rates: bool = True) -> Attachment:
@@ -188,6 +193,8 @@ def _attach_some(
         alpha_sigma=part.alpha_sigma,
         force_sigma=part.force_sigma,
         turn=turn,
+        vibration=part.vibration,
+        moving=None if part.moving is None else rotate(dR, part.moving),
     )
 
 
@@ -317,6 +324,8 @@ def motion_at(
         a_n=a_n,
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,
+        vibration_b=at.vibration,
+        moving_n=None if at.moving is None else rotate(at.turn, rotate(R, at.moving)),
     )
 
 

@@ -162,6 +162,8 @@ def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Att
         gyro=forward.gyro,
         alpha=forward.alpha,
         force=forward.force,
+        vibration=forward.vibration,
+        moving=None if forward.moving is None else rotate(back, forward.moving),
     )
 
 
@@ -182,7 +184,7 @@ def motion_two_way(at: TwoWay, states: States, gravity_n: Array, earth_rate_n: A
         a_n=one.a_n + s * (other.a_n - one.a_n) + rate * change,
         alpha_b=one.alpha_b + rate * (other.omega_eb_b - one.omega_eb_b),
         turning_b=rate * turn,
-        moving_n=rate * shift,
+        moving_n=rate * shift + (0.0 if one.moving_n is None else one.moving_n),
     )
     motion = extrapolated(blended, at.beyond)
     return motion if at.windows is None else averaged(motion, at.windows, gravity_n[at.segment])

@@ -68,9 +68,12 @@ class Motion:
     omega_sigma : ndarray, shape (M, 3), rad/s
         Standard deviation of omega_eb_b from the gyro's noise and from motion that its samples do
         not resolve.
-    turning_b, moving_n : ndarray, shape (M, 3), optional
-        Differences by which attitude and position change faster than omega_eb_b and v_n say, rad/s
-        and m/s: where two motions that differ are blended.
+    turning_b : ndarray, shape (M, 3), optional
+        Rate at which two attitudes that differ are blended, rad/s.
+    vibration_b : ndarray, shape (M, 3), optional
+        Rate of the attitude that omega_eb_b leaves out, rad/s.
+    moving_n : ndarray, shape (M, 3), optional
+        By how much the position changes faster than v_n says, m/s.
     mean : MeanMotion, optional
         How v_n and omega_eb_b depend on the motion, where they are means over windows.
     """
@@ -83,6 +86,7 @@ class Motion:
     alpha_b: Array
     omega_sigma: Array
     turning_b: Array | None = None
+    vibration_b: Array | None = None
     moving_n: Array | None = None
     mean: MeanMotion | None = None
 
@@ -91,9 +95,9 @@ class Motion:
         """Rates at which attitude and position change, (M, 3) each, rad/s in b and m/s in n."""
         if self.mean is not None:
             return self.mean.turn_rate_b, self.mean.move_rate_n
-        if self.turning_b is None or self.moving_n is None:
-            return self.omega_eb_b, self.v_n
-        return self.omega_eb_b + self.turning_b, self.v_n + self.moving_n
+        turning = [each for each in (self.turning_b, self.vibration_b) if each is not None]
+        moving = [] if self.moving_n is None else [self.moving_n]
+        return sum(turning, self.omega_eb_b), sum(moving, self.v_n)
 
 
 @dataclass(frozen=True)
