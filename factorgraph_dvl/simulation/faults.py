@@ -282,12 +282,17 @@ def dvl_slipped(turn_deg: Sequence[float], share: float = 0.5) -> Fault:
 
 
 def dvl_water_track(current_m_s: Sequence[float], duration_s: float = 60.0) -> Fault:
-    """Measure against a layer of water for a while, which a current, east, north, up, moves."""
+    """Measure against a layer of water, which a current, east, north, up, moves.
+
+    For a while; with an infinite duration, all the time.
+    """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl, reference = record_of(trial, "dvl"), trial.reference
         assert reference is not None
-        (inside,) = _spans(dvl.time, duration_s, 1, rng)
+        inside = np.ones(dvl.time.size, dtype=bool)
+        if np.isfinite(duration_s):
+            (inside,) = _spans(dvl.time, duration_s, 1, rng)
         rph = [np.interp(dvl.time, reference.time, angle) for angle in np.unwrap(reference.rph.T)]
         roll, pitch, heading = rph
         # Axes forward, starboard and down to north, east and down.

@@ -30,7 +30,7 @@ from factorgraph_dvl.statistics.scores import Score, Scores, scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
-_LOG10_P = -6.0
+_LOG10_P = -4.0
 # Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
 # the cause.
 _FAR = 4.0
@@ -97,7 +97,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
         return None
     evaluation, information = minimum.evaluation, minimum.information
     tests = _tests(problem, evaluation, information)
-    limit = _LOG10_P - np.log10(max(len(tests), 1))
+    asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
+    limit = _LOG10_P - np.log10(max(asked, 1))
     significant = [
         (p, test) for p, test in tests.values() if test.log10_p < limit and _is_plausible(p, test)
     ]

@@ -146,6 +146,8 @@ DISTORTED = {
     "dvl_scale_by_place_1_km": ([2e-5, 0.0, 1e-4], [-1.94, 0.0, 0.0]),
     # An hour after the middle.
     "dvl_scale_by_time_1_h": ([0.01 / 3600.0], [-2.02, 0.0, 0.0]),
+    # What was measured is zero along y and z.
+    "dvl_truncation_m_s": ([0.005], [-1.995, 0.0, 0.0]),
 }
 
 
@@ -159,9 +161,10 @@ def test_a_distortion_by_hand(name):
         dvl_bias_m_s=np.zeros(3),
     )
     values[name] = np.array(stated)
-    o = DvlVelocity(np.array([3600.0]), np.zeros((1, 3)), np.full((1, 3), 0.01))
+    measured = np.array([[-2.0, 0.0, 0.0]])
+    o = DvlVelocity(np.array([3600.0]), measured, np.full((1, 3), 0.01))
     at = replace(hand_motion(), p_n=np.array([[1000.0, 0.0, -500.0]]))
-    np.testing.assert_allclose(o.residual(at, values), [expected], atol=1e-12)
+    np.testing.assert_allclose(o.residual(at, values) + measured, [expected], atol=1e-12)
 
 
 @pytest.mark.parametrize("turned", ["roll", "pitch"])
