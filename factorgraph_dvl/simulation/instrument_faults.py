@@ -58,6 +58,23 @@ def dvl_scale_by_speed(per_m_s: float) -> Fault:
     return fault
 
 
+def dvl_averages(length_s: float) -> Fault:
+    """Give for each ping the mean of those in a window about it."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = record_of(trial, "dvl")
+        ends = [
+            np.searchsorted(dvl.time, dvl.time + 0.5 * sign * length_s, side=side)
+            for sign, side in ((-1.0, "left"), (1.0, "right"))
+        ]
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(dvl.velocity, axis=0)])
+        first, last = ends
+        velocity = (sums[last] - sums[first]) / (last - first)[:, None]
+        return with_arrays(trial, "dvl", velocity=velocity)
+
+    return fault
+
+
 def gyros_late(delay_s: float) -> Fault:
     """Give each sample of the gyros as it was some time before, beside accelerometers in time."""
 

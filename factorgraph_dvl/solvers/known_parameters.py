@@ -216,9 +216,10 @@ def _shown_by_records(
         found = record_scores(problem, here, evaluation, information, own, motion)
         ratio = scattered[label] / problem.noise_factors[label] if label in scattered else 1.0
         variance = float(np.mean(np.square(ratio)))
-        out += [
-            known[name] for name in own if found.test(name).divided(variance).log10_p < _LOG10_P
-        ]
+        for p in (known[name] for name in own):
+            test = found.test(p.name, wide(p, p.mean).sigma).divided(variance)
+            if test.log10_p < _LOG10_P:
+                out.append(p)
     return out
 
 

@@ -40,10 +40,20 @@ class RecordScores:
     score: Array
     information: Array
 
-    def test(self, name: str) -> Score:
-        """Return the test of a parameter; the step is zero along what the data say nothing of."""
+    def test(self, name: str, wide: Array | float = np.inf) -> Score:
+        """Return the test of a parameter; the step is zero along what nothing is known of.
+
+        Parameters
+        ----------
+        name : str
+            Name of the parameter.
+        wide : ndarray or float, SI
+            Standard deviations of its prior; by default it has none.
+        """
         own = self.places[name]
-        information, score = self.information[own, own], self.score[own]
+        score = self.score[own]
+        prior = np.broadcast_to(np.asarray(wide, float) ** -2.0, score.size)
+        information = self.information[own, own] + np.diag(prior)
         size = np.sqrt(np.maximum(np.diag(information), 0.0))
         known = size > _ROUNDING * np.max(size, initial=0.0)
         # In units in which each component has an information of one.
