@@ -19,14 +19,14 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
-from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, ParameterSpec
+from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, Frame, ParameterSpec
 from factorgraph_dvl.sensors.protocol import Motion
 
 _BY_XY = tuple(f"{turned}{by}" for turned in "xyz" for by in "xy")
 
 
 def _spec(
-    stem: str, unit: str, labels: tuple[str, ...], plausible: float, frame: str = "d"
+    stem: str, unit: str, labels: tuple[str, ...], plausible: float, frame: Frame = "d"
 ) -> ParameterSpec:
     return ParameterSpec(
         f"dvl_{stem}",

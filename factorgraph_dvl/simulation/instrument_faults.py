@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -63,12 +64,9 @@ def dvl_averages(length_s: float) -> Fault:
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl = record_of(trial, "dvl")
-        ends = [
-            np.searchsorted(dvl.time, dvl.time + 0.5 * sign * length_s, side=side)
-            for sign, side in ((-1.0, "left"), (1.0, "right"))
-        ]
+        first = np.searchsorted(dvl.time, dvl.time - 0.5 * length_s)
+        last = np.searchsorted(dvl.time, dvl.time + 0.5 * length_s, side="right")
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(dvl.velocity, axis=0)])
-        first, last = ends
         velocity = (sums[last] - sums[first]) / (last - first)[:, None]
         return with_arrays(trial, "dvl", velocity=velocity)
 
@@ -80,9 +78,9 @@ def gyros_late(delay_s: float) -> Fault:
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         imu = trial.inertial
-        before = imu.time - delay_s
-        gyro = np.stack([np.interp(before, imu.time, axis) for axis in imu.gyro.T], axis=1)
-        return with_arrays(trial, "imu", gyro=gyro)
+        # Straight lines between samples would be a low pass.
+        before = np.maximum(imu.time - delay_s, imu.time[0])
+        return with_arrays(trial, "imu", gyro=CubicSpline(imu.time, imu.gyro)(before))
 
     return fault
 
