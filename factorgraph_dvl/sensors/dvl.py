@@ -28,7 +28,6 @@ from factorgraph_dvl.sensors.dvl_distortion import (
     NAMES,
     SCALE_DIFFERENCE,
     SPECS,
-    TRUNCATION,
     Distortion,
     is_distorted,
 )
@@ -414,12 +413,7 @@ class DvlVelocity(ObservationByRows):
         if is_distorted(values):
             found = self._distortion(motion, values, dvl_b)
             dvl_b, scale, axes = found.turned(), found.scale, found.axes @ axes
-        predicted = (1.0 + scale) * (dvl_b @ axes.T) + values[BIAS]
-        return predicted - self._cut_off(values) - self.measured_d
-
-    def _cut_off(self, values: Values) -> Array | float:
-        """Return what cut off digits take from a velocity on average, (M, 3), m/s."""
-        return values[TRUNCATION] * np.sign(self.measured_d) if TRUNCATION in values else 0.0
+        return (1.0 + scale) * (dvl_b @ axes.T) + values[BIAS] - self.measured_d
 
     def _distortion(self, motion: Motion, values: Values, dvl_b: Array) -> Distortion:
         """Return what else becomes of velocities at the DVL, in body."""
@@ -443,7 +437,6 @@ class DvlVelocity(ObservationByRows):
         if distorted or not set(NAMES).isdisjoint(wanted):
             more = self._distortion(motion, values, dvl_b).derivatives(unscaled_d, dMb)
             derivatives |= more.parameters
-            derivatives[TRUNCATION] = lambda: -np.sign(self.measured_d)[:, :, None]
             by_velocity = more.velocity
         d_v = by_velocity @ bRn
         derivatives |= {
@@ -457,7 +450,7 @@ class DvlVelocity(ObservationByRows):
         if more is not None:
             d_theta, d_omega = d_theta + more.theta, d_omega + more.omega
         return Linearization(
-            residual=scale * unscaled_d + values[BIAS] - self._cut_off(values) - self.measured_d,
+            residual=scale * unscaled_d + values[BIAS] - self.measured_d,
             d_theta=d_theta,
             d_p=None if more is None or not distorted else more.place,
             d_v=d_v,

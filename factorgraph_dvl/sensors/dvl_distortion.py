@@ -6,8 +6,7 @@ scale, each axis of d reports
     (1 + k) A dRb E u,    E = Exp(F_t z + F_r omega + F_s s)
 
 where z are the x and y components of the vertical in body, the sines of its tilt, and omega those
-of the rate. k grows with speed, place and time. Digits that are cut off make the velocity smaller.
-All of it is zero where a trial does not state it.
+of the rate. k grows with speed, place and time. All of it is zero where a trial does not state it.
 """
 
 from __future__ import annotations
@@ -48,19 +47,16 @@ FLEX_BY_SPEED_SPEC = _spec("flex_by_speed", "deg_s_m", XYZ, 0.5, "b")
 SCALE_BY_SPEED_SPEC = _spec("scale_by_speed", "s_m", SCALAR, 0.01)
 SCALE_BY_PLACE_SPEC = _spec("scale_by_place", "1_km", ("e", "n", "u"), 0.1, "n")
 SCALE_BY_TIME_SPEC = _spec("scale_by_time", "1_h", SCALAR, 0.05)
-TRUNCATION_SPEC = _spec("truncation", "m_s", SCALAR, 0.05)
 
 SPECS = (
     *(AXES_SPEC, SCALE_DIFFERENCE_SPEC),
     *(FLEX_BY_TILT_SPEC, FLEX_BY_RATE_SPEC, FLEX_BY_SPEED_SPEC),
     *(SCALE_BY_SPEED_SPEC, SCALE_BY_PLACE_SPEC, SCALE_BY_TIME_SPEC),
-    TRUNCATION_SPEC,
 )
 NAMES = tuple(spec.name for spec in SPECS)
 AXES, SCALE_DIFFERENCE = NAMES[:2]
 FLEX_BY_TILT, FLEX_BY_RATE, FLEX_BY_SPEED = NAMES[2:5]
-SCALE_BY_SPEED, SCALE_BY_PLACE, SCALE_BY_TIME = NAMES[5:8]
-TRUNCATION = NAMES[8]
+SCALE_BY_SPEED, SCALE_BY_PLACE, SCALE_BY_TIME = NAMES[5:]
 # Pairs of axes by the labels of their angles.
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 # Least speed, m/s, that has a direction. Chosen: far below that of any ping.

@@ -146,8 +146,6 @@ DISTORTED = {
     "dvl_scale_by_place_1_km": ([2e-5, 0.0, 1e-4], [-1.94, 0.0, 0.0]),
     # An hour after the middle.
     "dvl_scale_by_time_1_h": ([0.01 / 3600.0], [-2.02, 0.0, 0.0]),
-    # What was measured is zero along y and z.
-    "dvl_truncation_m_s": ([0.005], [-1.995, 0.0, 0.0]),
 }
 
 

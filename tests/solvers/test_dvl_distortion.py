@@ -37,14 +37,12 @@ FAULTS = {
     "dvl_scale_by_speed_s_m": instrument_faults.dvl_scale_by_speed(0.002),
     "dvl_scale_by_time_1_h": faults.dvl_scale_drift(0.002),
     "current_m_s": faults.dvl_water_track((0.1, 0.0, 0.0), np.inf),
-    "dvl_truncation_m_s": instrument_faults.truncated("dvl", 0.01),
     "gyro_delay_s": instrument_faults.gyros_late(0.01),
 }
 EXPECTED = {
     "dvl_scale_by_speed_s_m": 0.002,
     "dvl_scale_by_time_1_h": 0.002 * 3600.0 / 450.0,
     "current_m_s": (0.1, 0.0),
-    "dvl_truncation_m_s": 0.005,
     "gyro_delay_s": 0.01,
 }
 
