@@ -10,6 +10,7 @@ import numpy as np
 from common import config
 
 from factorgraph_dvl.simulation import faults as f
+from factorgraph_dvl.simulation import instrument_faults as g
 
 KNOTS = 0.514444
 I3 = np.eye(3)
@@ -314,7 +315,7 @@ ROWS = (
         "",
         (0.002, 0.01),
         lambda x: [f.dvl_scale_drift(x)],
-        (gross("DVL"), r"^changed_along_trial[^:]*scale"),
+        (gross("DVL"), r"^changed_along_trial[^:]*scale", r"dvl_scale_by_time"),
     ),
     Row(
         "IMU: gyro bias walks",
@@ -400,6 +401,58 @@ ROWS = (
         lambda x: imu_errors(accel=np.tril(np.full((3, 3), np.radians(x)), -1)),
         (r"accel|IMU",),
     ),
+    Row(
+        "DVL: scale differs by axis",
+        "share",
+        (0.001, 0.005),
+        lambda x: turned("dvl", np.diag([1.0 + x, 1.0 - x, 1.0])),
+        (r"dvl_scale_difference",),
+    ),
+    Row(
+        "DVL: x and y not orthogonal",
+        "deg",
+        (0.1, 0.5),
+        lambda x: turned("dvl", I3 + np.radians(x) * np.outer(I3[1], I3[0])),
+        (r"dvl_axes",),
+    ),
+    Row(
+        "DVL: mount flexes with roll",
+        "deg/deg",
+        (0.01, 0.033),
+        lambda x: [g.dvl_flexes((0.0, 0.0, x))],
+        (r"dvl_flex",),
+    ),
+    Row(
+        "DVL: sound speed varies with place",
+        "share",
+        (0.0005, 0.002),
+        lambda x: [g.dvl_slow_water(x, 800.0)],
+        (r"scale_error|dvl_scale_by_place",),
+    ),
+    Row(
+        "DVL: scale grows with speed",
+        "s/m",
+        (0.0005, 0.002),
+        lambda x: [g.dvl_scale_by_speed(x)],
+        (r"dvl_scale_by_speed",),
+    ),
+    Row(
+        "DVL: measures against water",
+        "m/s",
+        (0.03, 0.1),
+        lambda x: [f.dvl_water_track((x, 0.0, 0.0), np.inf)],
+        (r"current",),
+    ),
+    Row(
+        "DVL: digits cut off",
+        "m/s",
+        (0.002, 0.01),
+        lambda x: [g.truncated("dvl", x)],
+        (gross("DVL"),),
+    ),
+    Row("DVL: averages", "s", (1.0, 3.0), lambda x: [g.dvl_averages(x)], (r"averaging",)),
+    Row("IMU: gyros late", "s", (0.002, 0.01), lambda x: [g.gyros_late(x)], (r"gyro_delay",)),
+    Row("IMU: gyros filtered", "s", (0.005, 0.03), lambda x: [g.gyros_lag(x)], (r"gyro_delay",)),
 )
 
 

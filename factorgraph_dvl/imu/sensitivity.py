@@ -1,7 +1,7 @@
 """How errors of the IMU that grow with rate and force move what is integrated from it.
 
-With gyro = (I + Mg) omega + Gg f and accel = (I + Ma) f, an error e of unit size adds the
-columns E to the rate and A to the force. To first order, since the start of a segment,
+With gyro = (I + Mg) omega + Gg f - tau alpha and accel = (I + Ma) f, an error e of unit size adds
+the columns E to the rate and A to the force. To first order, since the start of a segment,
 
     Theta = ∫ dR E dt,    V = ∫ ([dR f]x Theta - dR A) dt,    P = ∫ V dt
 
@@ -18,7 +18,7 @@ import numpy as np
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
 from factorgraph_dvl.imu.between_samples import edge_signals, hermite
-from factorgraph_dvl.imu.preintegration import Integrals, Segments
+from factorgraph_dvl.imu.preintegration import Integrals, Segments, Strides
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.imu.two_way import TwoWay, carried_back
 from factorgraph_dvl.sensors.imu import ERRORS, ImuError
@@ -38,8 +38,9 @@ class Sensitivity:
     theta, v, p : ndarray, shape (M, 3, n)
         Increments of rotation, velocity and position: -Theta, V, P, in the axes at the segment's
         start.
-    gyro, force : ndarray, shape (M, 3)
-        Rate and force at the times, of which E and A consist; at the ends of segments zero.
+    gyro, force, alpha : ndarray, shape (M, 3)
+        Rate, force and angular acceleration at the times, of which E and A consist; at the ends of
+        segments zero.
     """
 
     theta: Array
@@ -47,6 +48,7 @@ class Sensitivity:
     p: Array
     gyro: Array
     force: Array
+    alpha: Array
 
 
 def elements(parameters: Sequence[Parameter]) -> list[ImuError]:
@@ -54,24 +56,31 @@ def elements(parameters: Sequence[Parameter]) -> list[ImuError]:
     return [error for p in parameters for error in ERRORS[p.name]]
 
 
-def unit_errors(rate: Array, force: Array, errors: Sequence[ImuError]) -> tuple[Array, Array]:
+def unit_errors(
+    rate: Array, force: Array, alpha: Array, errors: Sequence[ImuError]
+) -> tuple[Array, Array]:
     """Return what unit errors add to rates (M, 3) and forces (M, 3), (M, 3, n) each."""
     added = {name: np.zeros((len(rate), 3, len(errors))) for name in ("rate", "force")}
-    by = {"rate": rate, "force": force}
+    by = _signals(rate, force, alpha)
     for column, error in enumerate(errors):
         added[error.of][:, error.row, column] = by[error.by][:, error.column]
     return added["rate"], added["force"]
 
 
 def added_by(
-    rate: Array, force: Array, errors: Sequence[ImuError], sizes: Array
+    rate: Array, force: Array, alpha: Array, errors: Sequence[ImuError], sizes: Array
 ) -> tuple[Array, Array]:
     """Return what errors of given sizes (n,) add to rates (M, 3) and forces (M, 3)."""
     added = {"rate": np.zeros_like(rate), "force": np.zeros_like(force)}
-    by = {"rate": rate, "force": force}
+    by = _signals(rate, force, alpha)
     for error, size in zip(errors, sizes.tolist(), strict=True):
         added[error.of][:, error.row] += size * by[error.by][:, error.column]
     return added["rate"], added["force"]
+
+
+def _signals(rate: Array, force: Array, alpha: Array) -> dict[str, Array]:
+    """Return what errors grow with: a late gyro has what the rate was before."""
+    return {"rate": rate, "force": force, "delay": -alpha}
 
 
 def sensitivities(
@@ -101,6 +110,7 @@ def sensitivities(
     for block in seg.blocks():
         strides, count = seg.strides(block), block.stop - block.start
         theta, v, p = _zeros(count, n)
+        alpha = _accelerations(seg, block, strides, errors)
         rows = [np.flatnonzero(_is_within(at.segment, block)) for at in attachments]
         segment = [
             at.segment[own] - block.start for at, own in zip(attachments, rows, strict=True)
@@ -117,7 +127,7 @@ def sensitivities(
                     out[own[here]] = now[inside[here]]
             live = np.flatnonzero(strides.count > j)
             i = strides.begins[live] + j
-            means = _means(strides.phi[i], strides.dv[i], strides.duration[i])
+            means = _means(strides.phi[i], strides.dv[i], strides.duration[i], alpha[i])
             step = _step(strides.dR[i], means, errors, (theta[live], v[live], p[live]))
             theta[live], v[live], p[live] = step
         for out, each in zip(whole, (-theta, v, p), strict=True):
@@ -128,27 +138,28 @@ def sensitivities(
             first = seg.first[at.segment[own]] + seg.stride * number
             last = np.minimum(first + seg.stride, seg.last[at.segment[own]]) - 1
             begin = _Edge(strides.dR[place], *edge_signals(seg.increments, first, after=False))
-            phi, length = strides.phi[place], strides.duration[place]
+            phi, length, turning = strides.phi[place], strides.duration[place], alpha[place]
             end = _Edge(begin.dR @ exp_so3(phi), *edge_signals(seg.increments, last, after=True))
             since = seg.node_time[at.node[own]] + at.tau[own] - strides.start[place]
             before = tuple(out[own] for out in outs)
-            after = _step(begin.dR, _means(phi, strides.dv[place], length), errors, before)
+            means = _means(phi, strides.dv[place], length, turning)
+            after = _step(begin.dR, means, errors, before)
             values, _ = hermite(since / length, length)
             theta, v, p = (
                 values[0] * one + values[1] * other + values[2] * slope + values[3] * next_slope
                 for one, other, slope, next_slope in zip(
                     before,
                     after,
-                    begin.slopes(before, errors),
-                    end.slopes(after, errors),
+                    begin.slopes(before, turning, errors),
+                    end.slopes(after, turning, errors),
                     strict=True,
                 )
             )
             for out, each in zip(outs, (-theta, v, p), strict=True):
                 out[own] = each
     nothing = np.zeros((seg.first.size, 3))
-    return Sensitivity(*whole, nothing, nothing), [
-        Sensitivity(*outs, at.gyro, at.force)
+    return Sensitivity(*whole, nothing, nothing, nothing), [
+        Sensitivity(*outs, at.gyro, at.force, at.alpha)
         for outs, at in zip(attached, attachments, strict=True)
     ]
 
@@ -232,9 +243,10 @@ def corrected(
     at: Attachment, by: Sensitivity, errors: Sequence[ImuError], sizes: Array
 ) -> Attachment:
     """Return an attachment without errors of the IMU of given sizes (n,)."""
-    rate, force = added_by(by.gyro, by.force, errors, sizes)
-    # What the slope of the force adds is next to nothing.
-    alpha, _ = added_by(at.alpha, np.zeros_like(by.force), errors, sizes)
+    rate, force = added_by(by.gyro, by.force, by.alpha, errors, sizes)
+    # What the slopes of force and angular acceleration add is next to nothing.
+    nothing = np.zeros_like(by.force)
+    alpha, _ = added_by(at.alpha, nothing, nothing, errors, sizes)
     return replace(
         at,
         dR=exp_so3(by.theta @ sizes) @ at.dR,
@@ -265,7 +277,7 @@ def by_errors(
     out = np.zeros((*lin.residual.shape, by.theta.shape[2]))
     d_theta = attitude_jacobian(lin, transition)
     if lin.d_omega is not None:
-        signals = {"rate": by.gyro, "force": by.force}
+        signals = _signals(by.gyro, by.force, by.alpha)
         for column, error in enumerate(errors):
             if error.of == "rate":
                 signal = signals[error.by][:, None, error.column]
@@ -297,13 +309,14 @@ def _stride_of(seg: Segments, at: Attachment, rows: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class _Means:
-    """Rate and force (M, 3) over steps of h s, (M,), in the axes in their middle.
+    """Rate, force and acceleration (M, 3) over steps of h s, (M,), in the axes in their middle.
 
     `half` (M, 3, 3) turns the axes in the middle into those at the start.
     """
 
     rate: Array
     force: Array
+    alpha: Array
     half: Array
     h: Array
 
@@ -316,20 +329,38 @@ class _Edge:
     rate: Array
     force: Array
 
-    def slopes(self, at: tuple[Array, ...], errors: Sequence[ImuError]) -> tuple[Array, ...]:
+    def slopes(
+        self, at: tuple[Array, ...], alpha: Array, errors: Sequence[ImuError]
+    ) -> tuple[Array, ...]:
         """Return the time derivatives of Theta, V and P there."""
         theta, v, _ = at
-        by_rate, by_force = unit_errors(self.rate, self.force, errors)
+        by_rate, by_force = unit_errors(self.rate, self.force, alpha, errors)
         pushed = skew(rotate(self.dR, self.force)) @ theta - self.dR @ by_force
         return self.dR @ by_rate, pushed, v
 
 
-def _means(phi: Array, dv: Array, h: Array) -> _Means:
+def _accelerations(
+    seg: Segments, block: slice, strides: Strides, errors: Sequence[ImuError]
+) -> Array:
+    """Return the mean angular acceleration (T, 3) over strides; zero where no error needs it."""
+    out = np.zeros_like(strides.phi)
+    if not any(error.by == "delay" for error in errors):
+        return out
+    number = np.arange(len(out)) - np.repeat(strides.begins, strides.count)
+    first = np.repeat(seg.first[block], strides.count) + seg.stride * number
+    last = np.minimum(first + seg.stride, np.repeat(seg.last[block], strides.count)) - 1
+    before = edge_signals(seg.increments, first, after=False)[0]
+    after = edge_signals(seg.increments, last, after=True)[0]
+    safe = np.where(strides.duration > _LEAST_STEP, strides.duration, np.inf)
+    return np.asarray((after - before) / safe[:, None])
+
+
+def _means(phi: Array, dv: Array, h: Array, alpha: Array) -> _Means:
     """Return the means over steps with increments (M, 3), in the axes at their start."""
     # A measurement may lie at the start of a step.
     safe = np.where(np.abs(h) > _LEAST_STEP, h, 1.0)[:, None]
     half = exp_so3(0.5 * phi)
-    return _Means(phi / safe, rotate(half.transpose(0, 2, 1), dv) / safe, half, h)
+    return _Means(phi / safe, rotate(half.transpose(0, 2, 1), dv) / safe, alpha, half, h)
 
 
 def _step(
@@ -338,7 +369,7 @@ def _step(
     """Return Theta, V and P after (M,) steps that start at rotations (M, 3, 3)."""
     theta, v, p = before
     h = means.h[:, None, None]
-    by_rate, by_force = unit_errors(means.rate, means.force, errors)
+    by_rate, by_force = unit_errors(means.rate, means.force, means.alpha, errors)
     middle = dR @ means.half
     turned = middle @ by_rate * h
     force = rotate(middle, means.force)

@@ -74,32 +74,40 @@ def consistency_findings(
     for e in estimates:
         out += _far_from_prior(e) + _impossible_scale(e)
     for r in residuals:
-        factor = factors.get(noise_name(r.label))
-        stated = r.sigma if factor is None else r.sigma / factor
-        rms = float(np.sqrt(np.nanmean((r.residual / stated) ** 2))) if r.time.size else 0.0
-        if rms > DO_NOT_FIT:
-            out.append(
-                Finding(
-                    Code.DOES_NOT_FIT,
-                    message("does_not_fit.residuals", ratio=rms),
-                    sensor=r.label,
-                )
-            )
-        elif rms > TOO_LARGE:
-            key = "large_residuals.stated" if factor is None else "large_residuals.estimated"
-            allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
-            out.append(
-                Finding(
-                    Code.LARGE_RESIDUALS,
-                    message(key, ratio=rms),
-                    sensor=r.label,
-                    severity="note" if allowed else "warning",
-                )
-            )
-        if factor is not None and np.nanmin(factor) < NOISE_FACTORS[0]:
-            text = message("small_residuals.noise", ratio=np.nanmin(factor))
-            out.append(Finding(Code.SMALL_RESIDUALS, text, sensor=r.label))
+        out += _size_of_residuals(r, factors.get(noise_name(r.label)))
     return out
+
+
+def _size_of_residuals(r: Residuals, factor: Array | None) -> list[Finding]:
+    """Return a finding where residuals are larger or smaller than stated."""
+    stated = r.sigma if factor is None else r.sigma / factor
+    square = (r.residual / stated) ** 2
+    rms = float(np.sqrt(np.nanmean(square))) if r.time.size else 0.0
+    least = 1.0 if factor is None else float(np.nanmin(factor))
+    small = least < NOISE_FACTORS[0]
+    if rms <= TOO_LARGE:
+        text = message("small_residuals.noise", ratio=least)
+        return [Finding(Code.SMALL_RESIDUALS, text, sensor=r.label)] if small else []
+    code, key = Code.DOES_NOT_FIT, "does_not_fit.residuals"
+    severity = code.severity
+    if rms <= DO_NOT_FIT:
+        code = Code.LARGE_RESIDUALS
+        key = "large_residuals.stated" if factor is None else "large_residuals.estimated"
+        allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
+        severity = "note" if allowed else "warning"
+    text = message(key, ratio=rms)
+    if small:
+        # One number for both, by component.
+        enter = np.sqrt(np.nanmean(square, axis=0)) * np.nanmedian(stated, axis=0)
+        text = message(
+            "large_residuals.and_small",
+            large=text,
+            small=least,
+            values=enter,
+            unit=r.unit,
+            components=list(r.components),
+        )
+    return [Finding(code, text, sensor=r.label, severity=severity)]
 
 
 def _impossible_scale(e: Estimate) -> list[Finding]:

@@ -23,6 +23,14 @@ from factorgraph_dvl.sensors.averaging import (
     window_length,
 )
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
+from factorgraph_dvl.sensors.dvl_distortion import (
+    AXES_SPEC,
+    NAMES,
+    SCALE_DIFFERENCE,
+    SPECS,
+    Distortion,
+    is_distorted,
+)
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -59,7 +67,10 @@ LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
 AVERAGING_SPEC = averaging_spec()
-CURRENT_SPEC = ParameterSpec("current", "m_s", labels=("e", "n"), frame="n")
+# Plausible size, m/s. Chosen: tides and ocean currents.
+CURRENT_SPEC = ParameterSpec(
+    "current", "m_s", labels=("e", "n"), frame="n", plausible=0.5, of_record=True
+)
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
 SCALE_ERROR = SCALE_SPEC.name
@@ -97,6 +108,7 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     # msgspec (0.22 at least) corrupts memory where a union holds a constrained number and
     # a tuple of fixed length; the number is checked by its name.
     scale_error_std: float | Sigma3 = 0.1
+    axes_std_deg: Sigma3 = (0.0, 0.0, 0.0)
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     lever_arm_std_m: Sigma3 = (10.0, 10.0, 10.0)
     bias_std_m_s: Sigma3 = (0.001, 0.001, 0.001)
@@ -115,9 +127,9 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The walk of the scale and the window, where there are any."""
-        keys = ("scale_walk_std_sqrt_h", "averaging_s")
-        return tuple(key for key in keys if getattr(self, key) > 0.0)
+        """The walk of the scale, the window and the axes, where there are any."""
+        keys = ("scale_walk_std_sqrt_h", "averaging_s", "axes_std_deg")
+        return tuple(key for key in keys if np.any(np.array(getattr(self, key)) > 0.0))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -173,6 +185,7 @@ class Dvl:
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
         *(MISALIGNMENT_SPEC, SCALE_SPEC, SCALES_SPEC, LEVER_ARM_SPEC),
         *(BIAS_SPEC, *CLOCK.specs, AVERAGING_SPEC, CURRENT_SPEC),
+        *SPECS,
     )
 
     def __post_init__(self) -> None:
@@ -226,7 +239,7 @@ class Dvl:
         return np.maximum(np.where(np.isnan(self.std), model, self.std), _LEAST_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return misalignment, scale error, lever arm, bias, clock and current.
+        """Return misalignment, scale error, lever arm, bias, clock, current and distortion.
 
         Raises
         ------
@@ -257,6 +270,7 @@ class Dvl:
         axes = max(mean.size, sigma.size)
         through_water = s.reference == "water"
         current = np.array(s.current_std_m_s) if through_water else np.zeros(2)
+        stated = {AXES_SPEC.name: np.array(s.axes_std_deg) * DEG}
         return (
             Parameter(
                 MISALIGNMENT_SPEC,
@@ -273,6 +287,12 @@ class Dvl:
             *CLOCK.parameters(s),
             window_length(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
+            *(
+                Parameter(spec, np.zeros(spec.size), stated.get(spec.name, np.zeros(spec.size)))
+                for spec in SPECS
+                # The scale of each axis is there already.
+                if axes == 1 or spec.name != SCALE_DIFFERENCE
+            ),
         )
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
@@ -289,7 +309,13 @@ class Dvl:
         walk = ScaleWalk(SCALE_ERROR, rate, time, velocity) if rate > 0.0 else None
         return (
             DvlVelocity(
-                time, velocity, self.std[m], noise, correlated=correlated, scale_walk=walk
+                time,
+                velocity,
+                self.std[m],
+                noise,
+                correlated=correlated,
+                scale_walk=walk,
+                middle=0.5 * float(time[0] + time[-1]),
             ),
         )
 
@@ -328,7 +354,8 @@ class DvlVelocity(ObservationByRows):
 
     all at the true time of the ping, which is time - offset. k acts per axis of d where
     it has three components. c_n is the current, zero for bottom track. The large-angle
-    form of Luo et al. (2024), eq. 1, with the rate relative to the Earth.
+    form of Luo et al. (2024), eq. 1, with the rate relative to the Earth; what else there
+    may be is in `sensors.dvl_distortion`.
 
     Parameters
     ----------
@@ -340,6 +367,8 @@ class DvlVelocity(ObservationByRows):
         Standard deviations; nan where they follow from `noise`.
     noise : tuple of (float, float), optional
         Floor, m/s, and fraction of the speed.
+    middle : float, optional
+        When a scale that changes with time is that of the trial, s.
     """
 
     time: Array
@@ -358,7 +387,9 @@ class DvlVelocity(ObservationByRows):
         LEVER_ARM,
         BIAS,
         CURRENT,
+        *NAMES,
     )
+    middle: float = 0.0
     clock: Clock = CLOCK
     averaging: str | None = AVERAGING
 
@@ -378,33 +409,52 @@ class DvlVelocity(ObservationByRows):
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in d, (M, 3), m/s."""
         dvl_b, _ = _velocity_at_dvl(motion, values)
-        predicted = (1.0 + values[SCALE_ERROR]) * (dvl_b @ values[MISALIGNMENT].T)
-        return predicted + values[BIAS] - self.measured_d
+        scale, axes = values[SCALE_ERROR], values[MISALIGNMENT]
+        if is_distorted(values):
+            found = self._distortion(motion, values, dvl_b)
+            dvl_b, scale, axes = found.turned(), found.scale, found.axes @ axes
+        return (1.0 + scale) * (dvl_b @ axes.T) + values[BIAS] - self.measured_d
+
+    def _distortion(self, motion: Motion, values: Values, dvl_b: Array) -> Distortion:
+        """Return what else becomes of velocities at the DVL, in body."""
+        return Distortion(values, motion, dvl_b, self.time - self.middle, values[SCALE_ERROR])
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         dvl_b, imu_b = _velocity_at_dvl(motion, values)
         bRn = motion.nRb.transpose(0, 2, 1)
-        scale = 1.0 + values[SCALE_ERROR]
-        unscaled_d = dvl_b @ values[MISALIGNMENT].T
-        dMb = scale[:, None] * values[MISALIGNMENT]
-        lever_arm = values[LEVER_ARM]
+        scale, axes, flexed_b = 1.0 + values[SCALE_ERROR], values[MISALIGNMENT], dvl_b
+        distorted = is_distorted(values)
+        if distorted:
+            found = self._distortion(motion, values, dvl_b)
+            scale, axes, flexed_b = 1.0 + found.scale, found.axes @ axes, found.turned()
+        unscaled_d = flexed_b @ axes.T
+        dMb = by_velocity = scale[..., None] * axes
         n_scale = values[SCALE_ERROR].size
         d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
-        d_v = dMb @ bRn
-
-        derivatives: dict[str, Callable[[], Array]] = {
-            MISALIGNMENT: lambda: -dMb @ skew(dvl_b),
+        derivatives: dict[str, Callable[[], Array]] = {}
+        more = None
+        if distorted or not set(NAMES).isdisjoint(wanted):
+            more = self._distortion(motion, values, dvl_b).derivatives(unscaled_d, dMb)
+            derivatives |= more.parameters
+            by_velocity = more.velocity
+        d_v = by_velocity @ bRn
+        derivatives |= {
+            MISALIGNMENT: lambda: -dMb @ skew(flexed_b),
             SCALE_ERROR: lambda: d_scale,
-            LEVER_ARM: lambda: dMb @ skew(motion.omega_eb_b),
+            LEVER_ARM: lambda: by_velocity @ skew(motion.omega_eb_b),
             BIAS: lambda: np.broadcast_to(np.eye(3), d_v.shape),
             CURRENT: lambda: -d_v[:, :, :2],
         }
+        d_theta, d_omega = by_velocity @ skew(imu_b), -by_velocity @ skew(values[LEVER_ARM])
+        if more is not None:
+            d_theta, d_omega = d_theta + more.theta, d_omega + more.omega
         return Linearization(
             residual=scale * unscaled_d + values[BIAS] - self.measured_d,
-            d_theta=dMb @ skew(imu_b),
+            d_theta=d_theta,
+            d_p=None if more is None or not distorted else more.place,
             d_v=d_v,
-            d_omega=np.broadcast_to(-dMb @ skew(lever_arm), d_v.shape),
+            d_omega=np.broadcast_to(d_omega, d_v.shape),
             d_parameters={name: make() for name, make in derivatives.items() if name in wanted},
         )
 

@@ -136,14 +136,16 @@ class ImuError:
 
     Parameters
     ----------
-    of, by : {'rate', 'force'}
-        What it changes, and what it grows with.
+    of : {'rate', 'force'}
+        What it changes.
+    by : {'rate', 'force', 'delay'}
+        What it grows with: a delay, with how fast the rate changes.
     row, column : int
         Axis that it changes, and axis that it grows with.
     """
 
     of: Literal["rate", "force"]
-    by: Literal["rate", "force"]
+    by: Literal["rate", "force", "delay"]
     row: int
     column: int
 
@@ -159,7 +161,7 @@ def _error_spec(
     stem: str,
     unit: str,
     of: Literal["rate", "force"],
-    by: Literal["rate", "force"],
+    by: Literal["rate", "force", "delay"],
     elements: tuple[tuple[int, int], ...],
     plausible: float,
 ) -> tuple[ParameterSpec, tuple[ImuError, ...]]:
@@ -174,6 +176,7 @@ _ERRORS = (
     _error_spec("gyro_scale", "ppm", "rate", "rate", _DIAGONAL, 1e4),
     _error_spec("gyro_misalignment", "deg", "rate", "rate", _OFF_DIAGONAL, 0.5),
     _error_spec("gyro_g_sensitivity", "deg_h_g", "rate", "force", _FULL, 100.0),
+    _error_spec("gyro_delay", "s", "rate", "delay", _DIAGONAL, 0.05),
     _error_spec("accel_scale", "ppm", "force", "force", _DIAGONAL, 1e4),
     _error_spec("accel_misalignment", "deg", "force", "force", _BELOW, 0.5),
 )
@@ -194,9 +197,10 @@ def within_limits(gyro: Array, accel: Array) -> bool:
 class ImuErrorStd:
     """Standard deviations of the errors of an IMU that grow with rate and force, SI.
 
-        gyro = (I + Mg) omega + Gg f + bias,    accel = (I + Ma) f + bias
+        gyro = (I + Mg) omega + Gg f - tau alpha + bias,    accel = (I + Ma) f + bias
 
-    with the scale errors on the diagonals. Every off-diagonal element of Mg has the stated
+    with the scale errors on the diagonals, and tau by how much each gyro is late, to first order a
+    delay or the time constant of a filter. Every off-diagonal element of Mg has the stated
     standard deviation; Ma is a lower triangle, as the accelerometer triad defines the body.
 
     Parameters
@@ -207,6 +211,8 @@ class ImuErrorStd:
         Standard deviation of an off-diagonal element of Mg, rad.
     gyro_g_sensitivity : float
         Standard deviation of an element of Gg, (rad/s)/(m/s²).
+    gyro_delay : float
+        Standard deviation of an element of tau, s.
     accel_scale : float
         Standard deviation of a diagonal element of Ma.
     accel_misalignment : float
@@ -216,6 +222,7 @@ class ImuErrorStd:
     gyro_scale: float = 0.0
     gyro_misalignment: float = 0.0
     gyro_g_sensitivity: float = 0.0
+    gyro_delay: float = 0.0
     accel_scale: float = 0.0
     accel_misalignment: float = 0.0
 
@@ -245,6 +252,7 @@ class ImuSettings(SensorSection, frozen=True, kw_only=True):
     gyro_g_sensitivity_std_deg_h_g: NonNegative = _NOT_STATED
     accel_scale_std_ppm: NonNegative = _NOT_STATED
     accel_misalignment_std_deg: NonNegative = _NOT_STATED
+    gyro_delay_std_s: NonNegative = 0.0
     gravity_deflection_std_arcsec: NonNegative = 10.0
 
     def __post_init__(self) -> None:
@@ -266,6 +274,7 @@ class ImuSettings(SensorSection, frozen=True, kw_only=True):
             gyro_g_sensitivity=(
                 self.gyro_g_sensitivity_std_deg_h_g * DEG_PER_HOUR / STANDARD_GRAVITY
             ),
+            gyro_delay=self.gyro_delay_std_s,
             accel_scale=self.accel_scale_std_ppm * PPM,
             accel_misalignment=self.accel_misalignment_std_deg * DEG,
         )

@@ -13,7 +13,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.unit_vectors import turns_to
-from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, MICRO_G, PPM, STANDARD_GRAVITY
+from factorgraph_dvl.geometry.units import DEG, DEG_PER_HOUR, HOUR, MICRO_G, PPM, STANDARD_GRAVITY
 from factorgraph_dvl.geometry.vectors import Array
 
 # Rounding may leave a correlation matrix with an eigenvalue this far below zero.
@@ -45,6 +45,10 @@ UNITS = {
     "m_s": Unit(1.0, "m/s"),
     "s": Unit(1.0, "s"),
     "ppm": Unit(PPM, "ppm"),
+    "s_m": Unit(1.0, "s/m"),
+    "deg_s_m": Unit(DEG, "deg s/m"),
+    "1_km": Unit(1e-3, "1/km"),
+    "1_h": Unit(1.0 / HOUR, "1/h"),
 }
 
 
@@ -79,6 +83,8 @@ class ParameterSpec:
         parameter is known, tests ask whether another value would explain a misfit.
     usual : bool, default False
         Whether most sensors have it although trials do not state it: a length, above zero.
+    of_record : bool, default False
+        Whether it changes one record only, and no motion: the rows of that record test it.
     """
 
     stem: str
@@ -92,6 +98,7 @@ class ParameterSpec:
     nuisance: bool = False
     plausible: float | None = None
     usual: bool = False
+    of_record: bool = False
 
     @cached_property
     def name(self) -> str:

@@ -105,7 +105,7 @@ def jitter(section: str, std_s: float) -> Fault:
             moved = np.sort(time + std_s * rng.standard_normal(time.size))
             return moved + 1e-9 * np.arange(time.size)
 
-        return _with(trial, section, time=scattered(_record(trial, section).time))
+        return with_arrays(trial, section, time=scattered(record_of(trial, section).time))
 
     return fault
 
@@ -119,12 +119,12 @@ def correlated_gnss(
     """Add Gauss-Markov errors to position and velocity of GNSS, east, north and up."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        gnss = _record(trial, "gnss")
+        gnss = record_of(trial, "gnss")
         wander = gauss_markov(gnss.time, position_tau_s, 3, rng) * position_std_m
         change = gauss_markov(gnss.time, velocity_tau_s, 3, rng) * velocity_std_m_s
         # A displacement by zero would change the last digits.
         geodetic = displaced(gnss.geodetic, wander) if wander.any() else gnss.geodetic
-        return _with(trial, "gnss", geodetic=geodetic, velocity=gnss.velocity + change)
+        return with_arrays(trial, "gnss", geodetic=geodetic, velocity=gnss.velocity + change)
 
     return fault
 
@@ -133,12 +133,12 @@ def gnss_jumps(size_m: float = 10.0, duration_s: float = 30.0, count: int = 3) -
     """Move the position of GNSS to a random side, some times for a while."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        gnss = _record(trial, "gnss")
+        gnss = record_of(trial, "gnss")
         moved = np.zeros_like(gnss.geodetic)
         for inside in _spans(gnss.time, duration_s, count, rng):
             side = rng.uniform(0.0, 2.0 * np.pi)
             moved[inside, :2] = size_m * np.array([np.cos(side), np.sin(side)])
-        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, moved))
+        return with_arrays(trial, "gnss", geodetic=displaced(gnss.geodetic, moved))
 
     return fault
 
@@ -147,9 +147,9 @@ def gnss_outliers(share: float = 0.1, sigmas: tuple[float, float] = (10.0, 100.0
     """Move a share of the fixes by so many stated standard deviations, in random directions."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        gnss = _record(trial, "gnss")
+        gnss = record_of(trial, "gnss")
         step = _gross(gnss.time.size, share, sigmas, rng) * gnss.settings.position_std_m
-        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, step))
+        return with_arrays(trial, "gnss", geodetic=displaced(gnss.geodetic, step))
 
     return fault
 
@@ -158,9 +158,9 @@ def datum(shift_m: Sequence[float]) -> Fault:
     """Give the fixes in another datum: shifted east, north and up, all by the same vector."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        gnss = _record(trial, "gnss")
+        gnss = record_of(trial, "gnss")
         shift = np.tile(np.asarray(shift_m, float), (gnss.time.size, 1))
-        return _with(trial, "gnss", geodetic=displaced(gnss.geodetic, shift))
+        return with_arrays(trial, "gnss", geodetic=displaced(gnss.geodetic, shift))
 
     return fault
 
@@ -169,8 +169,8 @@ def fixes_swapped() -> Fault:
     """Write latitude and longitude into each other's column."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        gnss = _record(trial, "gnss")
-        return _with(trial, "gnss", geodetic=gnss.geodetic[:, [1, 0, 2]])
+        gnss = record_of(trial, "gnss")
+        return with_arrays(trial, "gnss", geodetic=gnss.geodetic[:, [1, 0, 2]])
 
     return fault
 
@@ -179,9 +179,11 @@ def wrong_antenna(error_m: Sequence[float]) -> Fault:
     """State a lever arm of the antenna that is off by a vector in body axes."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        settings = _record(trial, "gnss").settings
+        settings = record_of(trial, "gnss").settings
         stated = tuple((np.array(settings.lever_arm_m) + error_m).tolist())
-        return _with(trial, "gnss", settings=msgspec.structs.replace(settings, lever_arm_m=stated))
+        return with_arrays(
+            trial, "gnss", settings=msgspec.structs.replace(settings, lever_arm_m=stated)
+        )
 
     return fault
 
@@ -190,9 +192,9 @@ def dvl_bias(bias_m_s: Sequence[float]) -> Fault:
     """Add a constant velocity in the axes of the DVL."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
-        out = _with(trial, "dvl", velocity=dvl.velocity + np.asarray(bias_m_s))
-        return _truth(out, "dvl_bias_m_s", np.asarray(bias_m_s, float))
+        dvl = record_of(trial, "dvl")
+        out = with_arrays(trial, "dvl", velocity=dvl.velocity + np.asarray(bias_m_s))
+        return with_truth(out, "dvl_bias_m_s", np.asarray(bias_m_s, float))
 
     return fault
 
@@ -201,9 +203,9 @@ def dvl_scale_drift(total: float) -> Fault:
     """Let the scale of the DVL grow linearly by a total over the trial, zero at the middle."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         drift = total * ((dvl.time - dvl.time.mean()) / np.ptp(dvl.time))
-        return _with(trial, "dvl", velocity=dvl.velocity * (1.0 + drift)[:, None])
+        return with_arrays(trial, "dvl", velocity=dvl.velocity * (1.0 + drift)[:, None])
 
     return fault
 
@@ -212,12 +214,14 @@ def dvl_scale_walk(std_sqrt_h: float) -> Fault:
     """Let the scale of the DVL walk at random, by a standard deviation per √h, zero on average."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         steps = rng.standard_normal(dvl.time.size) * std_sqrt_h
         steps[1:] *= np.sqrt(np.diff(dvl.time) / HOUR)
         steps[0] = 0.0
         walk = np.cumsum(steps)
-        return _with(trial, "dvl", velocity=dvl.velocity * (1.0 + walk - walk.mean())[:, None])
+        return with_arrays(
+            trial, "dvl", velocity=dvl.velocity * (1.0 + walk - walk.mean())[:, None]
+        )
 
     return fault
 
@@ -229,11 +233,11 @@ def correlated_dvl(std_m_s: float, tau_s: float = 5.0, std_fraction: float = 0.0
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         speed = np.linalg.norm(dvl.velocity, axis=1, keepdims=True)
         std = np.hypot(std_m_s, std_fraction * speed)
         error = std * gauss_markov(dvl.time, tau_s, 3, rng)
-        return _with(trial, "dvl", velocity=dvl.velocity + error)
+        return with_arrays(trial, "dvl", velocity=dvl.velocity + error)
 
     return fault
 
@@ -242,12 +246,12 @@ def dvl_outliers(share: float = 0.1, sigmas: tuple[float, float] = (10.0, 300.0)
     """Move a share of the pings by so many stated standard deviations, in random directions."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         speed = np.linalg.norm(dvl.velocity, axis=1, keepdims=True)
         stated = dvl.settings
         std = np.hypot(stated.velocity_std_m_s, stated.velocity_std_fraction * speed)
         step = _gross(dvl.time.size, share, sigmas, rng) * std
-        return _with(trial, "dvl", velocity=dvl.velocity + step)
+        return with_arrays(trial, "dvl", velocity=dvl.velocity + step)
 
     return fault
 
@@ -256,10 +260,10 @@ def dvl_false_lock(speed_m_s: float = 0.3, duration_s: float = 60.0) -> Fault:
     """Lock on something that moves, such as a layer of fish: a constant velocity for a while."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         (inside,) = _spans(dvl.time, duration_s, 1, rng)
         moving = speed_m_s * _directions(1, rng)
-        return _with(trial, "dvl", velocity=dvl.velocity + moving * inside[:, None])
+        return with_arrays(trial, "dvl", velocity=dvl.velocity + moving * inside[:, None])
 
     return fault
 
@@ -268,22 +272,27 @@ def dvl_slipped(turn_deg: Sequence[float], share: float = 0.5) -> Fault:
     """Turn the DVL in its mount after a share of the record, by a rotation vector in its axes."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl = _record(trial, "dvl")
+        dvl = record_of(trial, "dvl")
         after = dvl.time > dvl.time[0] + share * np.ptp(dvl.time)
         turn = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
         velocity = np.where(after[:, None], dvl.velocity @ turn.T, dvl.velocity)
-        return _with(trial, "dvl", velocity=velocity)
+        return with_arrays(trial, "dvl", velocity=velocity)
 
     return fault
 
 
 def dvl_water_track(current_m_s: Sequence[float], duration_s: float = 60.0) -> Fault:
-    """Measure against a layer of water for a while, which a current, east, north, up, moves."""
+    """Measure against a layer of water, which a current, east, north, up, moves.
+
+    For a while; with an infinite duration, all the time.
+    """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        dvl, reference = _record(trial, "dvl"), trial.reference
+        dvl, reference = record_of(trial, "dvl"), trial.reference
         assert reference is not None
-        (inside,) = _spans(dvl.time, duration_s, 1, rng)
+        inside = np.ones(dvl.time.size, dtype=bool)
+        if np.isfinite(duration_s):
+            (inside,) = _spans(dvl.time, duration_s, 1, rng)
         rph = [np.interp(dvl.time, reference.time, angle) for angle in np.unwrap(reference.rph.T)]
         roll, pitch, heading = rph
         # Axes forward, starboard and down to north, east and down.
@@ -293,7 +302,7 @@ def dvl_water_track(current_m_s: Sequence[float], duration_s: float = 60.0) -> F
         in_body = in_frd @ frd_from_body(trial.body_axes)
         mounted = Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
         moved = dvl.velocity - mounted.apply(in_body) * inside[:, None]
-        return _with(trial, "dvl", velocity=moved)
+        return with_arrays(trial, "dvl", velocity=moved)
 
     return fault
 
@@ -302,11 +311,11 @@ def frozen(section: str, duration_s: float = 30.0, field: str = "velocity") -> F
     """Repeat the value that a sensor had at the start of a random span."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        record = _record(trial, section)
+        record = record_of(trial, section)
         values = getattr(record, field).copy()
         (inside,) = _spans(record.time, duration_s, 1, rng)
         values[inside] = values[np.argmax(inside)]
-        return _with(trial, section, **{field: values})
+        return with_arrays(trial, section, **{field: values})
 
     return fault
 
@@ -315,10 +324,10 @@ def filled(section: str, share: float, value: float = 0.0, field: str = "velocit
     """Replace a share of the measurements by one value, as instruments do where they have none."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        record = _record(trial, section)
+        record = record_of(trial, section)
         values = getattr(record, field).copy()
         values[rng.uniform(size=record.time.size) < share] = value
-        return _with(trial, section, **{field: values})
+        return with_arrays(trial, section, **{field: values})
 
     return fault
 
@@ -327,9 +336,9 @@ def stuck(section: str, axis: int, field: str = "velocity") -> Fault:
     """Let one axis of a sensor repeat its first value throughout."""
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        values = getattr(_record(trial, section), field).copy()
+        values = getattr(record_of(trial, section), field).copy()
         values[:, axis] = values[0, axis]
-        return _with(trial, section, **{field: values})
+        return with_arrays(trial, section, **{field: values})
 
     return fault
 
@@ -348,10 +357,10 @@ def axes_changed(section: str, matrix: Sequence[Sequence[float]], *fields: str) 
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
-        record = _record(trial, section)
+        record = record_of(trial, section)
         names = fields or (("gyro", "accel") if section == "imu" else ("velocity",))
         turned = {name: getattr(record, name) @ np.asarray(matrix, float).T for name in names}
-        return _with(trial, section, **turned)
+        return with_arrays(trial, section, **turned)
 
     return fault
 
@@ -376,15 +385,15 @@ def imu_errors(
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         imu, truth = trial.inertial, trial.calibration_truth
         added = imu.gyro @ np.transpose(gyro) + imu.accel @ np.transpose(g_sensitivity)
-        out = _with(
+        out = with_arrays(
             trial, "imu", gyro=imu.gyro + added, accel=imu.accel + imu.accel @ np.transpose(accel)
         )
         # The biases in the samples are changed as well.
         gyro_bias = np.asarray(truth.get("gyro_bias_deg_h", np.zeros(3)))
         accel_bias = np.asarray(truth.get("accel_bias_ug", np.zeros(3)))
         leaked = np.asarray(g_sensitivity) @ accel_bias * (MICRO_G / DEG_PER_HOUR)
-        out = _truth(out, "gyro_bias_deg_h", np.asarray(gyro) @ gyro_bias + leaked)
-        return _truth(out, "accel_bias_ug", np.asarray(accel) @ accel_bias)
+        out = with_truth(out, "gyro_bias_deg_h", np.asarray(gyro) @ gyro_bias + leaked)
+        return with_truth(out, "accel_bias_ug", np.asarray(accel) @ accel_bias)
 
     return fault
 
@@ -398,9 +407,9 @@ def imu_bias_walk(gyro_deg_h_sqrt_h: float, accel_ug_sqrt_h: float = 0.0) -> Fau
         walk = np.cumsum(root * rng.standard_normal((imu.time.size, 6)), axis=0)
         gyro, accel = gyro_deg_h_sqrt_h * walk[:, :3], accel_ug_sqrt_h * walk[:, 3:]
         # The truth of a bias that walks is its mean.
-        trial = _truth(trial, "gyro_bias_deg_h", gyro.mean(axis=0))
-        trial = _truth(trial, "accel_bias_ug", accel.mean(axis=0))
-        return _with(
+        trial = with_truth(trial, "gyro_bias_deg_h", gyro.mean(axis=0))
+        trial = with_truth(trial, "accel_bias_ug", accel.mean(axis=0))
+        return with_arrays(
             trial,
             "imu",
             gyro=imu.gyro + DEG_PER_HOUR * gyro,
@@ -417,7 +426,7 @@ def imu_spikes(share: float, gyro_rad_s: float = 1.0, accel_m_s2: float = 10.0) 
         imu = trial.inertial
         hit = (rng.uniform(size=imu.time.size) < share)[:, None]
         gyro, accel = (hit * _directions(imu.time.size, rng) for _ in range(2))
-        return _with(
+        return with_arrays(
             trial, "imu", gyro=imu.gyro + gyro_rad_s * gyro, accel=imu.accel + accel_m_s2 * accel
         )
 
@@ -430,7 +439,7 @@ def sampling_misstated() -> Fault:
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         stated = trial.inertial.settings
         other = "mean" if stated.sampling == "instantaneous" else "instantaneous"
-        return _with(trial, "imu", settings=msgspec.structs.replace(stated, sampling=other))
+        return with_arrays(trial, "imu", settings=msgspec.structs.replace(stated, sampling=other))
 
     return fault
 
@@ -449,7 +458,7 @@ def saturated(gyro_rad_s: float = np.inf, accel_m_s2: float = np.inf) -> Fault:
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         imu = trial.inertial
-        return _with(
+        return with_arrays(
             trial,
             "imu",
             gyro=np.clip(imu.gyro, -gyro_rad_s, gyro_rad_s),
@@ -467,7 +476,7 @@ def _stamped(
     offset_s: float = 0.0,
     rate_ppm: float = 0.0,
 ) -> Trial:
-    out = _with(trial, section, time=clock(_record(trial, section).time))
+    out = with_arrays(trial, section, time=clock(record_of(trial, section).time))
     moved = {section: 1.0}
     if section == "imu":
         moved = {aid.section: -1.0 for aid in trial.aids}
@@ -476,8 +485,8 @@ def _stamped(
             out = replace(out, reference=reference)
     for aid, sign in moved.items():
         offset, rate = _clock_names(trial, aid)
-        out = _truth(out, offset, np.array([sign * offset_s]))
-        out = _truth(out, rate, np.array([sign * rate_ppm]))
+        out = with_truth(out, offset, np.array([sign * offset_s]))
+        out = with_truth(out, rate, np.array([sign * rate_ppm]))
     return out
 
 
@@ -489,7 +498,7 @@ def _clock_names(trial: Trial, section: str) -> tuple[str, str]:
     return f"{stem}_time_offset_s", f"{stem}_clock_rate_ppm"
 
 
-def _truth(trial: Trial, name: str, change: Array) -> Trial:
+def with_truth(trial: Trial, name: str, change: Array) -> Trial:
     """Return a trial whose true parameter has changed; one without a truth was zero before."""
     if not np.any(change):
         return trial
@@ -498,13 +507,15 @@ def _truth(trial: Trial, name: str, change: Array) -> Trial:
     return replace(trial, calibration_truth=truth)
 
 
-def _record(trial: Trial, section: str) -> Any:
+def record_of(trial: Trial, section: str) -> Any:
+    """Return the record of a section of a trial."""
     records = {record.section: record for record in trial.records}
     return records[section]
 
 
-def _with(trial: Trial, section: str, **arrays: Any) -> Trial:
-    record = replace(_record(trial, section), **arrays)
+def with_arrays(trial: Trial, section: str, **arrays: Any) -> Trial:
+    """Return a trial with other arrays or settings in the record of a section."""
+    record = replace(record_of(trial, section), **arrays)
     if section in ("imu", "gnss", "dvl"):
         return replace(trial, **{section: record})
     others = tuple(record if aid.section == section else aid for aid in trial.others)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
+from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 
 # χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
 # twenty is beyond, and loses some precision; one that does is left with less than two standard
@@ -25,8 +25,6 @@ from factorgraph_dvl.solvers.model import Estimated
 _SHOWN = 2.7
 # Measurements that are tested, and in how many stretches. Chosen: a third of a second of work.
 _ENOUGH, _STRETCHES = 5000, 20
-# Relative size of an eigenvalue of information that is none.
-_ROUNDING = 1e-9
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
 # Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
@@ -44,16 +42,22 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     problem, minimum : Problem or Minimum
         Problem, and its minimum.
     """
-    known = {p.name: p for p in problem.all_parameters if not p.estimated and p.spec.plausible}
+    known = {
+        p.name: p
+        for p in problem.all_parameters
+        if not (p.estimated or p.spec.plausible is None or p.spec.of_record)
+    }
     out = []
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         p = known.get(_length(bound))
         if p is None or not p.spec.usual or not bound.weight.any():
             continue
         own = [name for name in parameters_of(bound.observation) if name in known]
-        found = _chi_squares(problem, bound, minimum, residual, own)
-        if not found:
+        tests = _scores(problem, bound, minimum, own)
+        if tests.score[tests.places[p.name]][0] <= 0.0:
             continue
+        share = len(residual) / _some_of(len(residual)).size
+        found = {name: share * tests.test(name).chi2 for name in own}
         fall = found[p.name]
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
         most = max(_SHARE * _misfit(bound, residual), *found.values())
@@ -109,22 +113,15 @@ def _length(bound: BoundObservation) -> str:
     return bound.observation.averaging or ""
 
 
-def _chi_squares(
-    problem: Problem,
-    bound: BoundObservation,
-    minimum: Minimum,
-    residual: Array,
-    known: Sequence[str],
-) -> dict[str, float]:
-    """Return twice the fall of the cost by each of some known parameters.
+def _scores(
+    problem: Problem, bound: BoundObservation, minimum: Minimum, known: Sequence[str]
+) -> RecordScores:
+    """Return the scores of known parameters, the length of the window among them, of a record.
 
-    With J the whitened derivatives by one of them, A those by all variables, P the covariance of
-    these and r the residuals, rᵀJ (JᵀJ - JᵀA P AᵀJ)⁻¹ Jᵀr: the score tests of `statistics.scores`,
-    at the price of no elimination. Nothing where the window should not be longer.
+    Of many measurements, some.
     """
     evaluation = minimum.evaluation
-    values, length = evaluation.parameters, _length(bound)
-    some = _some_of(len(residual))
+    some = _some_of(bound.observation.time.size)
     window = replace(
         bound,
         observation=ObservationRows(bound.observation, some),
@@ -133,42 +130,6 @@ def _chi_squares(
         weight=bound.weight[some],
         averages=True,
     )
-    window.attach(values)
-    motion = window.motion(window.attachment, evaluation.states, values)
-    own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
-    wanted = [p.name for p in own]
-    lin = window.linearized(motion, values, [*wanted, *known], processes)
-    columns = {name: window.weight[:, :, None] * lin.d_parameters[name] for name in known}
-    by_known = np.concatenate(list(columns.values()), axis=2)
-    score = -np.einsum("mdk,md->k", by_known, residual[some])
-    parts = dict(zip(columns, _parts(columns.values()), strict=True))
-    if score[parts[length]][0] <= 0.0:
-        return {}
-    rows, _ = window.jacobian(
-        lin, slice(None), motion, evaluation.states, values, wanted, processes, {}
-    )
-    keys = window.keys_at(window.nodes(processes), processes, [problem.key(n) for n in wanted])
-    by_variables = np.einsum("mdk,mdn->mkn", by_known, rows)
-    edges = np.cumsum([0, *window.sizes(processes, own)])
-    taken_up: dict[int, Array] = {}
-    for variable, first, last in zip(keys.T, edges, edges[1:], strict=False):
-        different, place = np.unique(variable, return_inverse=True)
-        sums = np.zeros((different.size, by_known.shape[2], last - first))
-        np.add.at(sums, place, by_variables[:, :, first:last])
-        for key, each in zip(different.tolist(), sums, strict=True):
-            taken_up[key] = taken_up.get(key, 0.0) + each
+    window.attach(evaluation.parameters)
     information = minimum.square_root or factorized(problem, evaluation)[0]
-    left = np.einsum("mdk,mdl->kl", by_known, by_known) - information.covariance_of([taken_up])
-    # Of all measurements, by those that are tested.
-    share = len(residual) / some.size
-    out = {}
-    for name, part in parts.items():
-        step = np.linalg.lstsq(left[part, part], score[part], rcond=_ROUNDING)[0]
-        out[name] = share * float(score[part] @ step)
-    return out
-
-
-def _parts(columns: Iterable[Array]) -> list[slice]:
-    """Return the places of columns (M, d, n) side by side."""
-    edges = np.cumsum([0, *(column.shape[2] for column in columns)]).tolist()
-    return [slice(a, b) for a, b in pairwise(edges)]
+    return record_scores(problem, window, evaluation, information, known)

@@ -91,9 +91,10 @@ def component_changes(
         (float(time[0]), float(time[-1])),
         {problem.key(n): tilt.gradient[own] for n, own in problem.columns.items()} if tilt else {},
     )
+    allowed = np.concatenate([p.sigma / p.si for p, _ in rows])
     return [
-        ComponentChange(name, p, test)
-        for (name, p), test in zip(of_component, tests, strict=True)
+        ComponentChange(name, p, test.within(float(sigma)))
+        for (name, p), test, sigma in zip(of_component, tests, allowed, strict=True)
         if p.name not in ERRORS
     ]
 

@@ -22,6 +22,7 @@ from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.sensors.protocol import ObservationByRows
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.solvers.state_ranges import StateRanges, eliminated_by_ranges
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
@@ -29,7 +30,7 @@ from factorgraph_dvl.statistics.scores import Score, Scores, scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
-_LOG10_P = -6.0
+_LOG10_P = -4.0
 # Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
 # the cause.
 _FAR = 4.0
@@ -96,7 +97,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
         return None
     evaluation, information = minimum.evaluation, minimum.information
     tests = _tests(problem, evaluation, information)
-    limit = _LOG10_P - np.log10(max(len(tests), 1))
+    asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
+    limit = _LOG10_P - np.log10(max(asked, 1))
     significant = [
         (p, test) for p, test in tests.values() if test.log10_p < limit and _is_plausible(p, test)
     ]
@@ -105,16 +107,18 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     same, at = with_scattered_noise(problem, evaluation, problem.all_parameters)
     changes = component_changes(same, at, factorized(same, at)[0])
     certain = [e for e in changes if e.change.chi2 > CHANGED**2]
-    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
-    significant.sort(key=lambda each: -each[1].evidence(count))
+    significant.sort(key=lambda each: -_evidence(*each))
     parameter, test = significant[0]
-    # A change is one component.
-    more = (test.freedom - 1) * float(np.log(count))
+    # A change costs as one component does of what there are as many of as measurements.
+    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
+    more = test.chi2 - _evidence(parameter, test) - float(np.log(count))
     fall = test.chi2 * test.scatter - more
     if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
         return None
     others: tuple[str | Message, ...] = tuple(
-        p.name for p, t in significant[1:] if test.evidence(count) - t.evidence(count) < 2.0 * _TIE
+        p.name
+        for p, t in significant[1:]
+        if _evidence(parameter, test) - _evidence(p, t) < 2.0 * _TIE
     )
     others += tuple(
         message("unexplained_misfit.change", name=e.name, time=e.change.time)
@@ -124,6 +128,11 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
     return Explanation(parameter, test, others)
+
+
+def _evidence(p: Parameter, test: Score) -> float:
+    """Return what a parameter takes off the objective if it may be anything plausible."""
+    return test.evidence(wide(p, p.mean).sigma)
 
 
 def _is_sampling(scale: Score, imu: Imu) -> bool:
@@ -166,8 +175,10 @@ def _tests(
     known = [
         p
         for p in problem.all_parameters
-        if not (p.estimated or p.spec.plausible is None or p.spec.usual) and p.name in used
+        if not (p.estimated or p.spec.plausible is None or p.spec.usual or p.spec.of_record)
+        and p.name in used
     ]
+    known += _shown_by_records(problem, evaluation, information)
     out = _tests_of_priors(problem, evaluation, information)
     free = [*(p for p, _ in out.values()), *known]
     if not free:
@@ -179,6 +190,37 @@ def _tests(
         return out
     scatter = _scatter(problem.chain.node_time, ranges, columns, found)
     return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
+
+
+def _shown_by_records(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> list[Parameter]:
+    """Return the parameters of one record each that its rows ask for.
+
+    With noise as residuals differ from one to the next. What looks like one of them by far is
+    then tested with all others.
+    """
+    out: list[Parameter] = []
+    if problem.chain.interpolates:
+        return out
+    scattered = _as_scattered(problem, evaluation)
+    known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
+    for bound, at, motion in zip(
+        problem.bound, evaluation.attached, evaluation.motions, strict=True
+    ):
+        label = bound.observation.label
+        own = [name for name in parameters_of(bound.observation) if name in known]
+        if not (own and bound.weight.any()):
+            continue
+        here = replace(bound, attachment=at)
+        found = record_scores(problem, here, evaluation, information, own, motion)
+        ratio = scattered[label] / problem.noise_factors[label] if label in scattered else 1.0
+        variance = float(np.mean(np.square(ratio)))
+        for p in (known[name] for name in own):
+            test = found.test(p.name, wide(p, p.mean).sigma).divided(variance)
+            if test.log10_p < _LOG10_P:
+                out.append(p)
+    return out
 
 
 def _is_plausible(p: Parameter, test: Score) -> bool:

@@ -104,7 +104,7 @@ def settle(
     at = _first(start, report)
     iterations += at.minimum.iterations
     record = [SolverStep("start", at.objective, 0.0, 0.0)]
-    known = KnownParameters()
+    known = KnownParameters(at)
     walks = Walks(report, known)
     steps: list[Step] = [
         MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,

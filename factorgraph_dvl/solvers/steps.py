@@ -306,39 +306,73 @@ class Uncorrelated:
 
 @dataclass
 class KnownParameters:
-    """Parameters that are stated as known, but that the data say have another value."""
+    """Parameters that are stated as known, but that the data say have another value.
+
+    Parameters
+    ----------
+    first : Estimated, optional
+        The minimum with noise as stated and all measurements. Where gross errors and noise that
+        persists explain its misfit, a parameter may explain more, which then no longer shows.
+    """
 
     name = "a parameter that was stated"
+    first: Estimated | None = None
     freed: list[Explanation] = field(default_factory=list)
     left: Explanation | None = None
     _tested: _Asked = field(default_factory=_Asked)
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the most probable of these, with noise as stated and as found."""
-        model, minimum = at.model, at.minimum
-        if not minimum.converged or self._tested.before(model.parameters):
+        model = at.model
+        if not at.minimum.converged or self._tested.before(model.parameters):
             return
         self._tested.note(model.parameters)
-        # The test has a problem of its own, and more columns.
-        at.problem.release()
-        found = explanation(at.problem, minimum, model.prepared.trial.imu)
-        self.left = found
-        if found is None or len(self.freed) >= _MOST_FREED:
+        self.left = found = _explained(at)
+        if len(self.freed) >= _MOST_FREED:
             return
-        self.freed.append(found)
         self.left = None
-        parameters = tuple(
-            found.freed if p.name == found.parameter.name else p for p in model.parameters
-        )
-        tilt = model.tilt
-        if tilt is not None:
-            tilt = tilt.of(at.problem.parameters, tuple(p for p in parameters if p.estimated))
-        # What the misfit made of noise and gross errors is to be found anew.
-        stated = replace(model.as_stated(), parameters=parameters, tilt=tilt)
-        yield Proposal(stated, at.states, at.values)
-        yield _from(at, parameters=parameters, tilt=tilt)
-        # It did not explain enough.
-        self.freed.pop()
+        for cause in _different(found, self._at_first(at)):
+            self.freed.append(cause)
+            yield from _freeing(cause, at)
+            # It did not explain enough.
+            self.freed.pop()
+
+    def _at_first(self, at: Estimated) -> Explanation | None:
+        """Return what explains the first minimum, None where that has other parameters."""
+        first, model = self.first, at.model
+        found = model.robust_weights or model.processes != model.stated_processes
+        if first is None or first.model.parameters is not model.parameters or not found:
+            return None
+        if not first.model.is_applied(first.problem):
+            first.model.applied(first.problem)
+        return _explained(first)
+
+
+def _explained(at: Estimated) -> Explanation | None:
+    """Return the parameter that explains most of the misfit of a minimum."""
+    # The test has a problem of its own, and more columns.
+    at.problem.release()
+    return explanation(at.problem, at.minimum, at.model.prepared.trial.imu)
+
+
+def _different(*causes: Explanation | None) -> list[Explanation]:
+    """Return the causes that there are, each parameter once."""
+    return list({c.parameter.name: c for c in causes if c is not None}.values())
+
+
+def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
+    """Yield what estimates a parameter instead, with noise as stated and as found."""
+    model = at.model
+    parameters = tuple(
+        cause.freed if p.name == cause.parameter.name else p for p in model.parameters
+    )
+    tilt = model.tilt
+    if tilt is not None:
+        tilt = tilt.of(at.problem.parameters, tuple(p for p in parameters if p.estimated))
+    # What the misfit made of noise and gross errors is to be found anew.
+    stated = replace(model.as_stated(), parameters=parameters, tilt=tilt)
+    yield Proposal(stated, at.states, at.values)
+    yield _from(at, parameters=parameters, tilt=tilt)
 
 
 class Noise:

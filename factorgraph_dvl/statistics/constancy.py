@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -41,7 +41,8 @@ class Change:
     time : float, s
         When.
     size, std : float
-        Value after less value before, in the unit of the component, and its standard deviation.
+        Value after less value before, in the unit of the component, and its standard deviation,
+        by the data alone.
     """
 
     chi2: float
@@ -54,6 +55,14 @@ class Change:
     def significance(self) -> float:
         """Size in standard deviations, as many as the scatter of the scores allows."""
         return float(np.sqrt(self.chi2))
+
+    def within(self, sigma: float) -> Change:
+        """Return it where a change has a prior: what goes beyond that pays for it.
+
+        With V the information on the size, S²/(V + sigma⁻²) in place of S²/V.
+        """
+        share = sigma**2 / (sigma**2 + self.std**2) if np.isfinite(self.std) else 0.0
+        return replace(self, chi2=share * self.chi2, fall=share * self.fall)
 
 
 def changes(

@@ -47,13 +47,19 @@ class Score:
         std = self.std * np.sqrt(scatter)
         return Score(self.chi2 / scatter, self.freedom, self.step, std, self.scatter * scatter)
 
-    def evidence(self, count: int) -> float:
-        """Return what ranks causes: chi2, less what each component costs for a count of data.
+    def evidence(self, wide: Array) -> float:
+        """Return by how much -2 log likelihood falls, about, where it may be anything plausible.
 
-        As probabilities underflow for several at once (Schwarz, Estimating the dimension of a
-        model, Annals of Statistics 6(2), 1978).
+        As probabilities underflow for several at once, this ranks causes: chi2, less the logarithm
+        of how much better than by its wide prior each component is known (Laplace's method; Kass
+        and Raftery, Bayes factors, Journal of the American Statistical Association 90(430), 1995).
+
+        Parameters
+        ----------
+        wide : ndarray, shape (freedom,), SI
+            Standard deviations of the wide prior.
         """
-        return self.chi2 - self.freedom * float(np.log(count))
+        return self.chi2 - float(np.sum(np.log1p((wide / self.std) ** 2)))
 
 
 @dataclass(frozen=True)

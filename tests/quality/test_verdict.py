@@ -76,6 +76,23 @@ def test_without_convergence_nothing_is_to_be_used(findings):
     assert verdict.reasons[0].code == (Code.DOES_NOT_FIT if findings else Code.NOT_CONVERGED)
 
 
+def test_one_message_says_which_noise_to_enter_where_it_is_larger_and_smaller_than_stated():
+    # 0.1 m/s are stated. Residuals are 0.4 m/s along x and 0.2 along y, of which 0.031 m/s and
+    # 0.02 m/s are new in each measurement.
+    factor = np.array([0.31, 0.2])
+    residuals = Residuals(
+        *("GNSS velocity", "m/s", ("east", "north"), np.arange(50.0)),
+        residual=np.tile([0.4, -0.2], (50, 1)),
+        sigma=np.full((50, 2), 0.1) * factor,
+    )
+    (found,) = consistency_findings([], [residuals], [Noise("gnss_velocity", factor)])
+    assert found.code == Code.LARGE_RESIDUALS
+    # sqrt((16 + 4) / 2) = 3.2.
+    assert "3.2 times" in found.text
+    assert "0.2 times as large" in found.text
+    assert "enter 0.4, 0.2 m/s (east, north)" in found.text
+
+
 @pytest.mark.parametrize(
     ("size", "factor", "found"),
     [

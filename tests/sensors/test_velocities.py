@@ -17,6 +17,7 @@ from factorgraph_dvl.graph.clocks import linearized, true_time
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings, DvlVelocity
+from factorgraph_dvl.sensors.dvl_distortion import SPECS
 from factorgraph_dvl.sensors.gnss import LEVER_ARM, Gnss, GnssSettings
 from factorgraph_dvl.sensors.protocol import Motion, lever_arm_sigma
 from factorgraph_dvl.simulation import plan_motion, simulate
@@ -35,6 +36,7 @@ def dvl_values(**changes):
         "current_m_s": np.zeros(2),
         "gnss_time_offset_s": np.zeros(1),
         "gnss_clock_rate_ppm": np.zeros(1),
+        **{spec.name: np.zeros(spec.size) for spec in SPECS},
     } | changes
 
 
@@ -121,6 +123,69 @@ def test_dvl_velocity_jacobians(scale, misalignment):
         current_m_s=np.array([0.4, -0.6]),
     )
     check_jacobians(o, random_motion(), values, dvl.parameters())
+    distorted = values | {
+        spec.name: 0.02 * spec.si * rng.standard_normal(spec.size) for spec in SPECS
+    }
+    check_jacobians(o, random_motion(), distorted, dvl.parameters())
+
+
+DISTORTED = {
+    # At 2 m/s ahead, and no rate, the DVL sees (-2, 0, 0) in d, which is (0, 2, 0) in body.
+    # 0.02 rad are missing between x and y: y sees 0.01 of what is along x.
+    "dvl_axes_deg": ([0.02, 0.0, 0.0], [-2.0, -0.02, 0.0]),
+    "dvl_scale_difference": ([0.01, 0.02], [-2.0, 0.0, 0.0]),
+    # Level: no tilt turns anything.
+    "dvl_flex_by_tilt": ([0.1] * 6, [-2.0, 0.0, 0.0]),
+    # 0.01 rad for each m/s about body z: (-2 sin 0.02, 2 cos 0.02, 0) in body.
+    "dvl_flex_by_speed_deg_s_m": (
+        [0.0, 0.0, 0.01],
+        [-2.0 * np.cos(0.02), -2.0 * np.sin(0.02), 0.0],
+    ),
+    "dvl_scale_by_speed_s_m": ([0.01], [-2.04, 0.0, 0.0]),
+    # A kilometre east of the origin, 500 m below it.
+    "dvl_scale_by_place_1_km": ([2e-5, 0.0, 1e-4], [-1.94, 0.0, 0.0]),
+    # An hour after the middle.
+    "dvl_scale_by_time_1_h": ([0.01 / 3600.0], [-2.02, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", DISTORTED)
+def test_a_distortion_by_hand(name):
+    stated, expected = DISTORTED[name]
+    values = dvl_values(
+        misalignment_deg=QUARTER,
+        scale_error=np.zeros(1),
+        lever_arm_m=np.zeros(3),
+        dvl_bias_m_s=np.zeros(3),
+    )
+    values[name] = np.array(stated)
+    measured = np.array([[-2.0, 0.0, 0.0]])
+    o = DvlVelocity(np.array([3600.0]), measured, np.full((1, 3), 0.01))
+    at = replace(hand_motion(), p_n=np.array([[1000.0, 0.0, -500.0]]))
+    np.testing.assert_allclose(o.residual(at, values) + measured, [expected], atol=1e-12)
+
+
+@pytest.mark.parametrize("turned", ["roll", "pitch"])
+def test_a_mount_that_flexes_with_the_tilt_by_hand(turned):
+    # Bow up by 0.1 rad: the vertical's component along y of body, to the bow, is sin 0.1. A gain
+    # of 0.5 turns the mount by half of that about z. Starboard down: that along x is -sin 0.1.
+    angle = {"roll": [0.0, 0.1, 0.0], "pitch": [0.1, 0.0, 0.0]}[turned]
+    level = hand_motion()
+    nRb = level.nRb @ exp_so3(np.array(angle))
+    by = {"roll": 4, "pitch": 5}[turned]
+    values = dvl_values(
+        misalignment_deg=np.eye(3),
+        scale_error=np.zeros(1),
+        lever_arm_m=np.zeros(3),
+        dvl_bias_m_s=np.zeros(3),
+    )
+    values["dvl_flex_by_tilt"] = 0.5 * (np.arange(6) == by)
+    o = DvlVelocity(np.zeros(1), np.zeros((1, 3)), np.full((1, 3), 0.01))
+    # Ahead at 2 m/s.
+    motion = replace(level, nRb=nRb, v_n=nRb @ np.array([0.0, 2.0, 0.0]))
+    turn = 0.5 * {"roll": -np.sin(0.1), "pitch": np.sin(0.1)}[turned]
+    expected = [[-2.0 * np.sin(turn), 2.0 * np.cos(turn), 0.0]]
+    np.testing.assert_allclose(o.residual(motion, values), expected, atol=1e-12)
 
 
 def test_time_offset_derivative_is_that_of_the_true_motion():

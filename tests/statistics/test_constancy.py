@@ -14,7 +14,7 @@ from factorgraph_dvl.graph.problem import Rows
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.statistics.constancy import changes
+from factorgraph_dvl.statistics.constancy import Change, changes
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 TIME = np.arange(400.0)
@@ -124,3 +124,14 @@ def test_a_scale_that_changes_is_found_and_makes_the_result_useless():
     assert float(finding.text.split()[3]) == pytest.approx(0.01, rel=0.2)
     assert float(re.search(r"at (\d+) s", finding.text)[1]) == pytest.approx(30.0, abs=1.0)
     assert changed.verdict.grade == "do not use"
+
+
+def test_a_change_beyond_its_prior_pays_for_it():
+    # 1.5 ± 0.1 of a bias that is known to 0.05: 0.05² / (0.05² + 0.1²) = 0.2.
+    found = Change(100.0, 120.0, 30.0, 1.5, 0.1).within(0.05)
+    assert found.chi2 == pytest.approx(20.0)
+    assert found.fall == pytest.approx(24.0)
+    assert (found.size, found.std) == (1.5, 0.1)
+    # One that may be anything costs nothing; one that nothing is known of is none.
+    assert Change(100.0, 120.0, 30.0, 1.5, 0.1).within(1e6).chi2 == pytest.approx(100.0)
+    assert Change(0.0, 0.0, 30.0, 0.0, np.inf).within(1.0).chi2 == 0.0

@@ -71,7 +71,10 @@ def test_chi2_is_the_fall_of_the_cost(line, names):
 
 def test_the_cause_ranks_first(line):
     *_, found = line
-    ranked = sorted(WIDE, key=lambda name: -found.test([name]).evidence(60))
+    ranked = sorted(WIDE, key=lambda name: -found.test([name]).evidence(WIDE[name][1]))
     assert ranked[0] == "slope"
     assert found.test(["slope"]).log10_p < -5.0
+    # 60 data of unit noise, a third of their square: known to 0.224, with a prior of 1e3.
+    test = found.test(["slope"])
+    assert test.evidence(np.array([1e3])) == pytest.approx(test.chi2 - 16.8, abs=0.1)
     assert found.test(["slope"]).std == pytest.approx(1.0 / np.sqrt(60 / 3), rel=0.05)

@@ -1,0 +1,119 @@
+"""Errors of mounts, water and electronics that grow with the motion, as `simulation.faults`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.simulation.faults import Fault, record_of, with_arrays
+from factorgraph_dvl.trial import Reference, Trial
+
+
+def dvl_flexes(turn_deg_per_deg: Sequence[float], by: str = "roll") -> Fault:
+    """Turn the DVL in its mount in proportion to roll or pitch of the vehicle.
+
+    Parameters
+    ----------
+    turn_deg_per_deg : sequence of float, shape (3,)
+        Rotation vector about the axes of the DVL for each degree.
+    by : {'roll', 'pitch'}
+        What it grows with.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = record_of(trial, "dvl")
+        angle = _along(trial, dvl.time, _reference(trial).rph[:, ("roll", "pitch").index(by)])
+        turn = Rotation.from_rotvec(angle[:, None] * np.asarray(turn_deg_per_deg, float))
+        return with_arrays(trial, "dvl", velocity=turn.apply(dvl.velocity))
+
+    return fault
+
+
+def dvl_slow_water(share: float, length_m: float) -> Fault:
+    """Let the speed of sound, and with it the scale, vary along east as a wave with mean zero."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl, fixes = record_of(trial, "dvl"), _reference(trial).geodetic
+        at = LocalFrame(*fixes[0]).position(*fixes.T)
+        wave = np.sin(2.0 * np.pi * _along(trial, dvl.time, at[:, 0]) / length_m)
+        scale = 1.0 + share * (wave - wave.mean())
+        return with_arrays(trial, "dvl", velocity=dvl.velocity * scale[:, None])
+
+    return fault
+
+
+def dvl_scale_by_speed(per_m_s: float) -> Fault:
+    """Let the scale of the DVL grow with the speed, zero at the mean speed."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = record_of(trial, "dvl")
+        speed = np.linalg.norm(dvl.velocity, axis=1)
+        scale = 1.0 + per_m_s * (speed - np.nanmean(speed))
+        return with_arrays(trial, "dvl", velocity=dvl.velocity * scale[:, None])
+
+    return fault
+
+
+def dvl_averages(length_s: float) -> Fault:
+    """Give for each ping the mean of those in a window about it."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl = record_of(trial, "dvl")
+        first = np.searchsorted(dvl.time, dvl.time - 0.5 * length_s)
+        last = np.searchsorted(dvl.time, dvl.time + 0.5 * length_s, side="right")
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(dvl.velocity, axis=0)])
+        velocity = (sums[last] - sums[first]) / (last - first)[:, None]
+        return with_arrays(trial, "dvl", velocity=velocity)
+
+    return fault
+
+
+def gyros_late(delay_s: float) -> Fault:
+    """Give each sample of the gyros as it was some time before, beside accelerometers in time."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        # Straight lines between samples would be a low pass.
+        before = np.maximum(imu.time - delay_s, imu.time[0])
+        return with_arrays(trial, "imu", gyro=CubicSpline(imu.time, imu.gyro)(before))
+
+    return fault
+
+
+def gyros_lag(time_constant_s: float) -> Fault:
+    """Pass the gyros through a filter of first order."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        gain = -np.expm1(-np.diff(imu.time) / time_constant_s)
+        gyro = imu.gyro.copy()
+        for k, share in enumerate(gain):
+            gyro[k + 1] = gyro[k] + share * (imu.gyro[k + 1] - gyro[k])
+        return with_arrays(trial, "imu", gyro=gyro)
+
+    return fault
+
+
+def truncated(section: str, step: float, field: str = "velocity") -> Fault:
+    """Write values with few digits, truncated towards zero."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        values = getattr(record_of(trial, section), field)
+        return with_arrays(trial, section, **{field: step * np.trunc(values / step)})
+
+    return fault
+
+
+def _along(trial: Trial, time: Array, values: Array) -> Array:
+    """Return values of the reference at other times."""
+    return np.interp(time, _reference(trial).time, values)
+
+
+def _reference(trial: Trial) -> Reference:
+    assert trial.reference is not None
+    return trial.reference
