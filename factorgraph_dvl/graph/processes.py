@@ -121,11 +121,6 @@ class Process:
         """Nodes without an error, (J, size)."""
         return np.zeros((self.time.size, self.size))
 
-    def nodes_of(self, other: Process, nodes: Array) -> Array:
-        """Return its nodes (J, size) for the errors that nodes of another one have."""
-        sigma, before = self._of_nodes[0], other.error(nodes, self.time)
-        return np.divide(before, sigma, out=np.zeros(before.shape), where=sigma > 0.0)
-
     def place(self, time: Array) -> tuple[IntArray, Array]:
         """Return the nodes before times (M,), and the weights of the nodes after them."""
         j = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)

@@ -90,19 +90,6 @@ def _from(at: Estimated, **changes: Any) -> Proposal:
     return Proposal(replace(at.model, **changes), at.states, at.values)
 
 
-def _with_processes(at: Estimated, processes: tuple[Process, ...], **changes: Any) -> Proposal:
-    """Return a proposal with processes that have as many nodes as before, or more."""
-    moved = [
-        (p, q) for p, q in zip(at.model.processes, processes, strict=True) if p.time is not q.time
-    ]
-    values, reference = (
-        each | {q.name: q.nodes_of(p, each[p.name]) for p, q in moved if p.name in each}
-        for each in (at.values, at.model.reference[1])
-    )
-    changes["reference"] = (at.model.reference[0], reference)
-    return Proposal(replace(at.model, processes=processes, **changes), at.states, values)
-
-
 class _Asked:
     """Assumptions for which a step has asked what it asks once only."""
 
@@ -407,11 +394,8 @@ class Noise:
             if _same(changed, before) and _are_those(part, model.processes):
                 return
             change = {label: f / before[label] for label, f in changed.items()}
-            yield _with_processes(
-                at,
-                tuple(with_closer_nodes(p, problem, change) for p in part),
-                noise_factors=changed,
-            )
+            closer = tuple(with_closer_nodes(p, problem, change) for p in part)
+            yield _from(at, noise_factors=changed, processes=closer)
 
 
 class ImuNoise:

@@ -245,11 +245,12 @@ def test_branches_of_states_and_processes_are_joined_by_what_goes_last(walks, la
     assert set().union(*states) == set(range(-(-(time.size - 1) // 10)))
 
 
-def test_other_nodes_have_the_same_errors():
-    before = Process("a", 0, np.array([2.0, 0.0]), np.array([5.0, 5.0]), np.arange(0.0, 9.0, 4.0))
-    after = replace(before, sigma=np.array([4.0, 0.0]), time=np.arange(0.0, 9.0, 2.0))
-    nodes = np.array([[1.0, 0.0], [3.0, 0.0], [-1.0, 0.0]])
-    np.testing.assert_allclose(after.nodes_of(before, nodes)[:, 0], [0.5, 1.0, 1.5, 0.5, -0.5])
-    np.testing.assert_allclose(
-        after.error(after.nodes_of(before, nodes), after.time), before.error(nodes, after.time)
-    )
+def test_nodes_of_another_layout_start_without_an_error():
+    problem, values = problem_of(scenario(manoeuvres=SHORT, noise=True))
+    process = Process("GNSS position", 0, np.ones(3), np.full(3, 5.0), np.arange(0.0, 9.0, 4.0))
+    problem.processes = (process,)
+    states, parameters = problem.chain.states(values), problem.prior_values()
+    nodes = np.arange(9.0).reshape(3, 3)
+    for given, expected in ((nodes, nodes), (nodes[:2], process.zero)):
+        at = problem.values(states, parameters | {process.name: given})
+        np.testing.assert_array_equal(problem.arrays(at)[1][process.name], expected)
