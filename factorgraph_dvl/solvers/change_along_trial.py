@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class ComponentChange:
     parameter : Parameter
         Parameter of the component.
     change : Change
-        Its test, in reported units.
+        Its test, in reported units; its shifts are those of the components that are tested.
     """
 
     name: str
@@ -92,10 +92,11 @@ def component_changes(
         {problem.key(n): tilt.gradient[own] for n, own in problem.columns.items()} if tilt else {},
     )
     allowed = np.concatenate([p.sigma / p.si for p, _ in rows])
+    kept = [p.name not in ERRORS for _, p in of_component]
     return [
-        ComponentChange(name, p, test.within(float(sigma)))
-        for (name, p), test, sigma in zip(of_component, tests, allowed, strict=True)
-        if p.name not in ERRORS
+        ComponentChange(name, p, replace(test.within(float(sigma)), shift=test.shift[kept]))
+        for (name, p), test, sigma, is_kept in zip(of_component, tests, allowed, kept, strict=True)
+        if is_kept
     ]
 
 
@@ -106,7 +107,7 @@ def change_findings(
 
     Of several components the most probable one is named, and those that are about as probable.
     A change below what is good enough is a drift that the standard deviation lacks, and no reason
-    not to use the mean.
+    not to use the mean. Nor is a change of something else that moves what is calibrated by less.
 
     Parameters
     ----------
@@ -133,11 +134,21 @@ def change_findings(
     others: Message | str = ""
     if ties:
         others = message("changed_along_trial.others", names=[t.name for t in ties])
-    small = abs(change.size) < limits.get(best.parameter.name, 0.0)
+    # What changes is either calibrated, or moves what is.
+    moves = [(best, change.size)]
+    if best.parameter.name not in limits:
+        shifts = zip(tests, change.shift, strict=True)
+        moves = [(t, by) for t, by in shifts if t.parameter.name in limits]
+    small = bool(moves) and all(abs(by) < limits[t.parameter.name] for t, by in moves)
+    said = "changed_along_trial.changes"
+    if small and best.parameter.name in limits:
+        said = "changed_along_trial.drifts"
+    elif small:
+        said = "changed_along_trial.harmless"
     yield Finding(
         Code.CHANGED_ALONG_TRIAL,
         message(
-            "changed_along_trial.drifts" if small else "changed_along_trial.changes",
+            said,
             name=best.name,
             size=change.size,
             std=change.std,

@@ -43,6 +43,8 @@ class Change:
     size, std : float
         Value after less value before, in the unit of the component, and its standard deviation,
         by the data alone.
+    shift : ndarray, shape (P,)
+        What all components would be before the change, if it is free, less what they are.
     """
 
     chi2: float
@@ -50,6 +52,7 @@ class Change:
     time: float
     size: float
     std: float
+    shift: Array
 
     @property
     def significance(self) -> float:
@@ -84,6 +87,8 @@ def changes(
     change with unknown change point, Econometrica 61(4), 1993; Zeileis and Hornik, Generalized
     M-fluctuation tests for parameter instability, 2007). The most probable time has the largest.
 
+    A change by d shifts all components by -P (I - I(t))_i d, I being that of all measurements.
+
     Where the objective has a gradient g that no row has, the score of the whole trial is g. It
     counts as the information does: S(t) - I(t) P g, the score where the rows alone have their
     minimum.
@@ -114,8 +119,9 @@ def changes(
         along = sum(following[key].T @ own for key, own in gradient.items())
         before = before - known @ correlation @ along
     V = np.diagonal(known - known @ correlation @ known, axis1=1, axis2=2)
-    own, total = np.diagonal(known, axis1=1, axis2=2), np.diag(information.sum(axis=0))
-    share = own / np.maximum(total, np.finfo(float).tiny)
+    total = information.sum(axis=0)
+    own = np.diagonal(known, axis1=1, axis2=2)
+    share = own / np.maximum(np.diag(total), np.finfo(float).tiny)
     allowed = (share > _LEAST_SHARE) & (share < 1.0 - _LEAST_SHARE) & (_LEAST_LEFT * own < V)
     chi2 = np.where(allowed, before**2 / np.where(allowed, V, 1.0), 0.0)
     best = np.argmax(chi2, axis=0)
@@ -128,7 +134,8 @@ def changes(
             change = -np.sign(before[k, i]) * np.sqrt(chi2[k, i]) * std
         fall = float(chi2[k, i])
         scatter = _scatter(score, information, int(k) + 1, i) if fall > _WORTH_IT else 1.0
-        out.append(Change(fall / scatter, fall, float(edges[k]), float(change), float(std)))
+        shift = -scale * (correlation @ (total - known[k])[:, i]) * (change / scale[i])
+        out.append(Change(fall / scatter, fall, float(edges[k]), float(change), float(std), shift))
     return out
 
 

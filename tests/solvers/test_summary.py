@@ -9,6 +9,7 @@ import pytest
 import solved
 
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.clock import Clock
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers import change_along_trial
@@ -65,9 +66,24 @@ def test_what_the_data_do_not_determine_is_named_with_its_reason():
 @pytest.mark.parametrize(("size", "grade"), [(-9e-4, "doubtful"), (1.1e-3, "do not use")])
 def test_a_change_below_the_limit_of_its_parameter_is_a_drift(monkeypatch, size, grade):
     scale = Parameter(SCALE_SPEC, np.zeros(1), np.ones(1))
-    change = ComponentChange(scale.name, scale, Change(40.0, 40.0, 50.0, size, 1e-4))
+    change = ComponentChange(scale.name, scale, Change(40.0, 40.0, 50.0, size, 1e-4, np.zeros(1)))
     monkeypatch.setattr(change_along_trial, "component_changes", lambda *_: [change])
     trial, found = solved.turning()
     verdict = summarise(trial, found, rate_hz=2.0).verdict
     assert verdict.grade == grade
     assert [r.code for r in verdict.reasons] == [Code.CHANGED_ALONG_TRIAL]
+
+
+@pytest.mark.parametrize(("shift", "grade"), [(-9e-4, "doubtful"), (1.1e-3, "do not use")])
+def test_a_change_beside_the_calibration_counts_as_it_moves_it(monkeypatch, shift, grade):
+    scale = Parameter(SCALE_SPEC, np.zeros(1), np.ones(1))
+    clock = Parameter(Clock.of("gnss", prefix="gnss_").offset, np.zeros(1), np.ones(1))
+    beside = Change(9.0, 9.0, 50.0, 0.1, 1e-4, np.zeros(2))
+    change = Change(40.0, 40.0, 50.0, 0.5, 0.1, np.array([shift, 0.5]))
+    tests = [ComponentChange(p.name, p, c) for p, c in ((scale, beside), (clock, change))]
+    monkeypatch.setattr(change_along_trial, "component_changes", lambda *_: tests)
+    trial, found = solved.turning()
+    verdict = summarise(trial, found, rate_hz=2.0).verdict
+    assert verdict.grade == grade
+    (reason,) = verdict.reasons
+    assert clock.name in reason.text

@@ -56,6 +56,16 @@ def exact(data, i, time):
 
 
 @pytest.mark.parametrize("component", [0, 1])
+def test_a_change_shifts_the_components_as_a_fit_does(component):
+    data = np.random.default_rng(2).normal(size=400) + DESIGN[:, component] * (TIME > 150.0)
+    change = fitted(data)[component]
+    more = np.column_stack([DESIGN, DESIGN[:, component] * (change.time < TIME)])
+    one, both = (np.linalg.lstsq(A, data, rcond=None)[0] for A in (DESIGN, more))
+    assert change.size == pytest.approx(both[2])
+    assert change.shift == pytest.approx(both[:2] - one)
+
+
+@pytest.mark.parametrize("component", [0, 1])
 def test_the_test_is_the_fall_of_the_cost(component):
     data = np.random.default_rng(1).normal(size=400)
     data += 1.5 * DESIGN[:, component] * (TIME > 250)
@@ -128,10 +138,11 @@ def test_a_scale_that_changes_is_found_and_makes_the_result_useless():
 
 def test_a_change_beyond_its_prior_pays_for_it():
     # 1.5 ± 0.1 of a bias that is known to 0.05: 0.05² / (0.05² + 0.1²) = 0.2.
-    found = Change(100.0, 120.0, 30.0, 1.5, 0.1).within(0.05)
+    change = Change(100.0, 120.0, 30.0, 1.5, 0.1, np.zeros(1))
+    found = change.within(0.05)
     assert found.chi2 == pytest.approx(20.0)
     assert found.fall == pytest.approx(24.0)
     assert (found.size, found.std) == (1.5, 0.1)
     # One that may be anything costs nothing; one that nothing is known of is none.
-    assert Change(100.0, 120.0, 30.0, 1.5, 0.1).within(1e6).chi2 == pytest.approx(100.0)
-    assert Change(0.0, 0.0, 30.0, 0.0, np.inf).within(1.0).chi2 == 0.0
+    assert change.within(1e6).chi2 == pytest.approx(100.0)
+    assert Change(0.0, 0.0, 30.0, 0.0, np.inf, np.zeros(1)).within(1.0).chi2 == 0.0
