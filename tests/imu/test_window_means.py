@@ -117,7 +117,7 @@ def test_derivatives_are_those_of_the_value_where_samples_are_noisy(length):
         imu={"gyro_noise_deg_sqrt_h": 3.0, "accel_noise_ug_sqrt_hz": 3000.0},
     )
     moving = exact(noisy)
-    h = 1e-6
+    h = 1e-5
     for at in (length - 2.0 * h, length + 2.0 * h):
         ahead, behind = (motion(moving, TIME, at + sign * h) for sign in (1.0, -1.0))
         found = motion(moving, TIME, at).mean
