@@ -120,9 +120,7 @@ def _mean_error(
     return mean, out
 
 
-def _stated_std(
-    problem: Problem, lasting: Process | None, by_error: dict[int, Array]
-) -> float:
+def _stated_std(problem: Problem, lasting: Process | None, by_error: dict[int, Array]) -> float:
     """Return the standard deviation, deg, that is stated of the mean error of the heading."""
     variance = sum(
         float(np.sum((by_error[problem.key(p.name)] * p.sigma) ** 2))
@@ -130,7 +128,9 @@ def _stated_std(
         if problem.key(p.name) in by_error
     )
     if lasting is not None:
-        weight = np.array([by_error[lasting.key(j)][0, _HEADING] for j in range(lasting.time.size)])
+        weight = np.array(
+            [by_error[lasting.key(j)][0, _HEADING] for j in range(lasting.time.size)]
+        )
         apart = np.abs(lasting.time[:, None] - lasting.time)
         variance += float(weight @ np.exp(-apart / lasting.tau[_HEADING]) @ weight)
     return float(np.sqrt(variance)) / DEG
