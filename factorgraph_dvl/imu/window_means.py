@@ -258,9 +258,9 @@ def _steps(
 ) -> tuple[Array, ...]:
     """Return what h s, (M,), add to the integrals, with increments phi and dv.
 
-    By the means of Exp(-u phi) and of u Exp(-u phi), u from 0 to 1, and by how much more than those
-    of their chords the integrals of phi and dv are: so the slope of an integral is what is
-    integrated, also inside an interval.
+    By the means of Exp(-u phi) and of u Exp(-u phi), u from 0 to 1, and by what the integrals of
+    phi and dv are beyond those of their chords: so the slope of an integral is what is integrated,
+    also inside an interval.
     """
     bRt = dR.transpose(0, 2, 1)
     across = skew(phi)

@@ -27,7 +27,7 @@ _SAME, _BETTER = 0.3, 3.0
 _IN_A_ROW, _FAR = 5, 10.0
 # Rounds in which far fixes lose weight. Chosen: more change nothing.
 _ROUNDS = 10
-# Part of an angle up to which another one is the same. Chosen: by chance one mount in a hundred is.
+# Part of an angle up to which another one is the same. Chosen: one mount in a hundred is by chance.
 _SAME_ANGLE = 0.1
 _MISALIGNMENT = "usbl_misalignment_deg"
 # Range, m, beyond which no system hears a reply.

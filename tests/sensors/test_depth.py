@@ -66,7 +66,8 @@ def test_jacobians():
             lambda h: o.residual(motion, values | {"sea_surface_height_m": np.array([17.3]) + h}),
             1)),
         (lin.d_parameters["depth_scale_error"], differentiate(
-            lambda h: o.residual(motion, values | {"depth_scale_error": np.array([0.01]) + h}), 1)),
+            lambda h: o.residual(motion, values | {"depth_scale_error": np.array([0.01]) + h}),
+            1)),
     ):  # fmt: skip
         np.testing.assert_allclose(stated, numerical, atol=2e-6)
     assert np.abs(lin.d_theta).max() > 1.0
