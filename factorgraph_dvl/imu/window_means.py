@@ -38,8 +38,8 @@ _CHUNK = 50_000
 _APART = 1000
 # Lengths, s, up to the shorter of which the effect is a straight line in the square of the length
 # through these two: so it has a derivative at zero, and vibration between samples, which no sensor
-# follows, is averaged there too. In sway of 2 Hz it is off by 0.03 %. Up to the longer one the line
-# bends to the slope there: where a slope jumps, a minimisation does not end.
+# follows, is averaged there too. In sway of 2 Hz it is off by 0.03 %. The line then bends to the
+# slope at the longer one: where a slope jumps, a minimisation does not end.
 _SHORT, SHORTEST = 0.05, 0.1
 # Part of the length that a window keeps where the samples end. Chosen: regular.
 _LEAST = 1e-3

@@ -27,7 +27,7 @@ _SAME, _BETTER = 0.3, 3.0
 _IN_A_ROW, _FAR = 5, 10.0
 # Rounds in which far fixes lose weight. Chosen: more change nothing.
 _ROUNDS = 10
-# Part of an angle up to which another one is the same. Chosen: one mount in a hundred is by chance.
+# Part of an angle up to which another is the same. Chosen: one mount in a hundred is by chance.
 _SAME_ANGLE = 0.1
 _MISALIGNMENT = "usbl_misalignment_deg"
 # Range, m, beyond which no system hears a reply.
@@ -66,15 +66,14 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
         yield from _elsewhere(usbl, distance, time)
 
 
-def grid_north_findings(
-    trial: Trial, usbl: Usbl, estimates: Sequence[Estimate]
-) -> Iterator[Finding]:
+def grid_north_findings(trial: Trial, estimates: Sequence[Estimate]) -> Iterator[Finding]:
     """Yield that the transceiver is turned as a heading in grid north makes it look, if it is.
 
     Nothing else tells the two apart: grid north is where the mount may be, too.
     """
+    usbl = trial.find(Usbl)
     found = {e.name: e for e in estimates}.get(_MISALIGNMENT)
-    if found is None:
+    if usbl is None or found is None:
         return
     lat, lon, _ = usbl.place()
     zone = int(np.floor(np.degrees(lon) / 6.0)) + 31

@@ -25,7 +25,6 @@ from factorgraph_dvl.quality.results import (
     outlier_findings,
 )
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.change_along_trial import change_findings
@@ -78,9 +77,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     findings += heading_and_misalignment(trial, found)
-    usbl = trial.find(Usbl)
-    if usbl is not None:
-        findings += grid_north_findings(trial, usbl, estimates)
+    findings += grid_north_findings(trial, estimates)
     return Solution(
         trial=trial.name,
         solver="batch",

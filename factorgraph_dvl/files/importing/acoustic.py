@@ -27,7 +27,7 @@ _SENTENCES = "nmea"
 _HEADING_STD = 1.0 * DEG
 # Chosen: time between records of the vessel, s, beyond which it is not known where it was.
 _LONGEST_STEP = 5.0
-# Share of the stated errors of fixes that is at least new in each, if they are independent. Chosen.
+# Share of the stated errors of fixes that is new in each, if they are independent. Chosen.
 _SMOOTH = 0.3
 
 
@@ -112,7 +112,9 @@ def _judge(label: str, changes: Array, stated: Array, decisions: Decisions) -> N
     found, std = float(np.median(np.abs(changes))) / 0.6745, float(np.median(stated))
     text = f"from one fix to the next, errors differ by {found:.2g} m; stated are {std:.2g} m"
     if found < _SMOOTH * std:
-        text += " → smoothed, or errors that last; only a DVL and attitude of that time tell which"
+        text += (
+            " → smoothed, or errors that last; a DVL and attitude of that time would show which"
+        )
     decisions.add(label, text, "usbl.position_std_m")
 
 
