@@ -93,9 +93,10 @@ class _Settings(Section, frozen=True, kw_only=True):
         if given & {"heading", "log"} and missing:
             raise ValueError(f"missing key `{missing[0]}`")
         if self.imu is UNSET and not {"attitude", "ins", "heading"} & given:
-            raise ValueError(
-                "missing key `imu`, or in its place `attitude` (AHRS, gyrocompass) or `ins`"
-            )
+            motion = "missing key `imu`, or in its place `attitude` (AHRS, gyrocompass) or `ins`"
+            if not {"dvl", "dvl_beams"} & given:
+                motion += "; and missing key `dvl`: positions alone have nothing to calibrate"
+            raise ValueError(motion)
 
     @property
     def aids(self) -> dict[str, SensorSection]:

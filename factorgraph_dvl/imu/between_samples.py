@@ -6,6 +6,8 @@ and force: a clock that moves a time over a sample finds no jump, and not the no
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
@@ -25,10 +27,7 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
     phi, dv = inc.over(index)
     dt = inc.dt[index]
     values, slopes = hermite(since / dt, dt)
-    across = cross(phi, rate_after)
-    # Rotation vectors turn by Jr^-1(phi) rate.
-    rate_after = rate_after + 0.5 * across + cross(phi, across) / 12.0
-    force_after = rotate(exp_so3(phi), force_after)
+    rate_after, force_after = _at_the_start(phi, rate_after, force_after)
     phi_at, dv_at = _cubic(values, phi, rate, rate_after), _cubic(values, dv, force, force_after)
     moved = 0.5 * dv * dt[:, None], np.zeros_like(dv), dv
     turning = _cubic(slopes, phi, rate, rate_after)
@@ -44,6 +43,44 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
         moving=_cubic(slopes, *moved) - dv_at,
         **signals,
     )
+
+
+@dataclass(frozen=True)
+class Cubics:
+    """What the cubics of `between_samples` have beyond their chords, over M parts of intervals.
+
+    Parameters
+    ----------
+    rate : ndarray, shape (M, 3), rad/s
+        Slope of the angle at the end.
+    angle, velocity : ndarray, shape (M, 3), rad s, m
+        Integrals of angle and velocity, less those of the chords.
+    """
+
+    rate: Array
+    angle: Array
+    velocity: Array
+
+
+def cubics_between(inc: Increments, index: IntArray, since: Array) -> Cubics:
+    """Return the cubics from the start of intervals (M,) to `since` seconds after it."""
+    before, after = (edge_signals(inc, index, after=after) for after in (False, True))
+    phi, dv = inc.over(index)
+    dt = inc.dt[index]
+    _, slopes = hermite(since / dt, dt)
+    rate_after, force_after = _at_the_start(phi, *after)
+    rate = _cubic(slopes, phi, before[0], rate_after)
+    force = _cubic(slopes, dv, before[1], force_after)
+    # Of a cubic, the mean is that of its ends and a twelfth of the change of its slope.
+    part = since[:, None] ** 2 / 12.0
+    return Cubics(rate, part * (before[0] - rate), part * (before[1] - force))
+
+
+def _at_the_start(phi: Array, rate: Array, force: Array) -> tuple[Array, Array]:
+    """Return slopes of rotation vector and velocity at the ends of intervals, in axes before."""
+    across = cross(phi, rate)
+    # Rotation vectors turn by Jr^-1(phi) rate.
+    return rate + 0.5 * across + cross(phi, across) / 12.0, rotate(exp_so3(phi), force)
 
 
 def hermite(u: Array, length: Array) -> tuple[Array, Array]:

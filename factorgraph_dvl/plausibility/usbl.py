@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, interpolate, median
 from factorgraph_dvl.message import Message, message
@@ -26,6 +27,9 @@ _SAME, _BETTER = 0.3, 3.0
 _IN_A_ROW, _FAR = 5, 10.0
 # Rounds in which far fixes lose weight. Chosen: more change nothing.
 _ROUNDS = 10
+# Part of an angle up to which another is the same. Chosen: one mount in a hundred is by chance.
+_SAME_ANGLE = 0.1
+_MISALIGNMENT = "usbl_misalignment_deg"
 # Range, m, beyond which no system hears a reply.
 _FARTHEST = 1.2e4
 # What a range is multiplied by where it was recorded as a time, one way or both, by 1500 m/s.
@@ -60,6 +64,28 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
         yield Finding(Code.USBL_TRACK, text, usbl.label)
     else:
         yield from _elsewhere(usbl, distance, time)
+
+
+def grid_north_findings(trial: Trial, estimates: Sequence[Estimate]) -> Iterator[Finding]:
+    """Yield that the transceiver is turned as a heading in grid north makes it look, if it is.
+
+    Nothing else tells the two apart: grid north is where the mount may be, too.
+    """
+    usbl = trial.find(Usbl)
+    found = {e.name: e for e in estimates}.get(_MISALIGNMENT)
+    if usbl is None or found is None:
+        return
+    lat, lon, _ = usbl.place()
+    zone = int(np.floor(np.degrees(lon) / 6.0)) + 31
+    from_middle = lon - np.radians(6.0 * zone - 183.0)
+    # A heading from grid north is smaller by the convergence: the bow seems turned back by it, and
+    # the transceiver, relative to the bow, to the other side. C takes the body to the transceiver.
+    grid = float(np.degrees(np.arctan(np.tan(from_middle) * np.sin(lat))))
+    down = frd_from_body(trial.body_axes)[2]
+    angle, std = -float(down @ found.value), float(np.linalg.norm(down * found.std))
+    if max(abs(angle - grid), 3.0 * std) < _SAME_ANGLE * abs(grid):
+        text = message("usbl_grid_north.as_large", angle=angle, std=std, zone=zone, grid=grid)
+        yield Finding(Code.USBL_GRID_NORTH, text, usbl.label, _MISALIGNMENT)
 
 
 def _elsewhere(usbl: Usbl, distance: Array, time: Array) -> Iterator[Finding]:

@@ -115,6 +115,7 @@ class Code(StrEnum):
     BEACON_HEIGHT = "beacon_height"
     USBL_TRACK = "usbl_track", "error"
     USBL_RUN = "usbl_run"
+    USBL_GRID_NORTH = "usbl_grid_north"
     AT_REST = "at_rest", "note"
     # Where a solver starts.
     UNUSABLE_PRIOR = "unusable_prior"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 import numpy as np
+from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
@@ -15,25 +16,31 @@ from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    ExpectedCorrelation,
     Linearization,
     Motion,
     Observation,
     PlainObservation,
     SensorSection,
     Values,
+    expected_correlation,
 )
 from factorgraph_dvl.sensors.records import check_range, check_times
 from factorgraph_dvl.settings.sections import NonNegative, Positive, Vector3
 
 _SEA_SURFACE = ParameterSpec("sea_surface_height", "m", labels=SCALAR)
 SEA_SURFACE_HEIGHT = _SEA_SURFACE.name
+_SCALE = ParameterSpec("depth_scale_error", labels=SCALAR)
+SCALE_ERROR = _SCALE.name
 _CLOCK = Clock.of("depth", prefix="depth_")
 
 
 class DepthSettings(ClockSection, frozen=True, kw_only=True):
     """Section `depth` of trial.yaml.
 
-    The sea is not the ellipsoid: the geoid leaves it by -107 to 86 m, and tide comes on top.
+    The sea is not the ellipsoid: the geoid leaves it by -107 to 86 m, and tide comes on top. A
+    density that is not that of the water makes a scale error; the air pressure and the sensor's
+    temperature, an offset that changes slowly.
     """
 
     file: str = "depth.csv"
@@ -41,6 +48,10 @@ class DepthSettings(ClockSection, frozen=True, kw_only=True):
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     sea_surface_height_m: float = 0.0
     sea_surface_height_std_m: NonNegative = 100.0
+    scale_error: float = 0.0
+    scale_error_std: NonNegative = 0.0
+    correlation_time_s: Positive | UnsetType = UNSET
+    correlated_std_m: NonNegative | UnsetType = UNSET
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,7 @@ class Depth:
     section_type: ClassVar[type[SensorSection]] = DepthSettings
     required: ClassVar[tuple[str, ...]] = ("time_s", "depth_m")
     optional: ClassVar[tuple[tuple[str, ...], ...]] = ()
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SEA_SURFACE, *_CLOCK.specs)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_SEA_SURFACE, _SCALE, *_CLOCK.specs)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -92,24 +103,31 @@ class Depth:
         return np.isnan(self.depth)
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the height of the sea surface above the ellipsoid, and the clock."""
+        """Return the height of the sea surface above the ellipsoid, the scale, and the clock."""
         s = self.settings
         mean, sigma = s.sea_surface_height_m, s.sea_surface_height_std_m
         surface = Parameter(_SEA_SURFACE, np.array([mean]), np.array([sigma]))
-        return (surface, *_CLOCK.parameters(s))
+        scale = Parameter(_SCALE, np.array([s.scale_error]), np.array([s.scale_error_std]))
+        return (surface, scale, *_CLOCK.parameters(s))
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the depths, where there are any."""
         m = np.logical_not(self.missing)
         if not m.any():
             return ()
-        arm = np.array(self.settings.lever_arm_m)
-        return (DepthBelowSurface(self.time[m], self.depth[m], self.settings.std_m, arm, frame),)
+        s = self.settings
+        arm = np.array(s.lever_arm_m)
+        slow = expected_correlation(s.correlation_time_s, s.correlated_std_m, 1)
+        return (
+            DepthBelowSurface(self.time[m], self.depth[m], s.std_m, arm, frame, correlated=slow),
+        )
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why the height of the sea surface or the clock could not be observed."""
         if parameter in _CLOCK.names:
             return message("not_observable.clock_by_depth")
+        if parameter == SCALE_ERROR:
+            return message("not_observable.depth_scale")
         return message("not_observable.sea_surface")
 
 
@@ -119,9 +137,10 @@ class DepthBelowSurface(PlainObservation):
 
     The error is zero where
 
-        depth = h_surface - h(p_n + nRb l)
+        depth = (1 + k) (h_surface - h(p_n + nRb l))
 
-    with h the height above the ellipsoid, of which dh/dp is the upward normal there.
+    with h the height above the ellipsoid, of which dh/dp is the upward normal there, and 1 + k
+    the ratio of the density of the water to that which the sensor supposes.
 
     Parameters
     ----------
@@ -135,6 +154,8 @@ class DepthBelowSurface(PlainObservation):
         IMU to sensor, in body, m.
     frame : LocalFrame
         Frame n.
+    correlated : ExpectedCorrelation, optional
+        Offset that changes slowly.
     """
 
     time: Array
@@ -142,11 +163,12 @@ class DepthBelowSurface(PlainObservation):
     std: float
     lever_arm: Array
     frame: LocalFrame
+    correlated: ExpectedCorrelation | None = None
     label: str = "Depth"
     unit: str = "m"
     components: tuple[str, ...] = ("down",)
     noise_groups: tuple[tuple[int, ...], ...] = ((0,),)
-    parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT,)
+    parameters: tuple[str, ...] = (SEA_SURFACE_HEIGHT, SCALE_ERROR)
     clock: Clock = _CLOCK
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
@@ -155,16 +177,26 @@ class DepthBelowSurface(PlainObservation):
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured, (M, 1), m."""
+        return ((1.0 + values[SCALE_ERROR]) * self._depth(motion, values) - self.measured)[:, None]
+
+    def _depth(self, motion: Motion, values: Values) -> Array:
+        """Return the depths of the sensor, (M,), m."""
         height = self.frame.geodetic(motion.p_n + motion.nRb @ self.lever_arm)[2]
-        return (values[SEA_SURFACE_HEIGHT] - height - self.measured)[:, None]
+        return np.asarray(values[SEA_SURFACE_HEIGHT] - height)
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         lat, lon, _ = self.frame.geodetic(motion.p_n + motion.nRb @ self.lever_arm)
-        up_n = self.frame.level_from_tangent(lat, lon)[:, 2:, :]
+        scale = 1.0 + values[SCALE_ERROR]
+        up_n = scale * self.frame.level_from_tangent(lat, lon)[:, 2:, :]
+        depth = self._depth(motion, values)
+        found = {
+            SEA_SURFACE_HEIGHT: np.full((self.time.size, 1, 1), scale),
+            SCALE_ERROR: depth[:, None, None],
+        }
         return Linearization(
-            residual=self.residual(motion, values),
+            residual=(scale * depth - self.measured)[:, None],
             d_theta=up_n @ motion.nRb @ skew(self.lever_arm),
             d_p=-up_n,
-            d_parameters={SEA_SURFACE_HEIGHT: np.ones((self.time.size, 1, 1))},
+            d_parameters={name: by for name, by in found.items() if name in wanted},
         )

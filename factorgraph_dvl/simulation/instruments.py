@@ -304,10 +304,21 @@ class DepthTruth(SimulatedInstrument, frozen=True, kw_only=True):
     std_m: NonNegative = 0.0
     lever_arm_m: Vector3 = (0.0, 0.0, 0.0)
     sea_surface_height_m: float = 0.0
+    scale_error: float | Draw = 0.0
+    scale_error_std: NonNegative = 0.0
+    correlated_std_m: NonNegative = 0.0
+    correlation_time_s: Positive = 1000.0
 
     def claimed(self) -> dict[str, Any]:
-        """Return noise and lever arm as simulated, but not the height of the sea surface."""
+        """Return noise and lever arm as simulated, but no height of the sea surface or scale."""
         out: dict[str, Any] = {"lever_arm_m": self.lever_arm_m}
+        if self.scale_error_std > 0.0:
+            out["scale_error_std"] = self.scale_error_std
+        if self.correlated_std_m > 0.0:
+            out |= {
+                "correlated_std_m": self.correlated_std_m,
+                "correlation_time_s": self.correlation_time_s,
+            }
         return out | ({"std_m": self.std_m} if self.std_m > 0.0 else {})
 
 

@@ -26,13 +26,17 @@ _HEADING = 2
 _LARGE_DEG = 15.0
 # Horizontal part of an axis that has a bearing. Chosen: at least one axis has more.
 _LEVEL = 0.5
+# Share of the stated standard deviation of the mean heading error from which on the data do not
+# tell it. Chosen: as that of directions that are left to the prior.
+_UNKNOWN = 0.8
 
 
 def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Finding]:
     """Say how well the misalignment is known relative to the mean of the compass.
 
     A heading that is too large by e looks like a misalignment by e about the vertical: without an
-    IMU data show their sum, with the mean of e over the trial.
+    IMU data show their sum, with the mean of e over the trial. Where they leave of the mean of e
+    what is stated of it, neither is determined alone.
     """
     problem, sensor = found.problem, trial.attitude
     parameters = {p.name: p for p in problem.parameters}
@@ -46,8 +50,10 @@ def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Fin
     frd = frd_from_body(trial.body_axes)
     down = frd[2]
     alone = {problem.key(_MISALIGNMENT): down[None]}
-    P = found.covariances.information.covariance_of([alone, alone | by_error])
-    std, relative_std = (float(x) for x in np.sqrt(np.diag(P)) / DEG)
+    P = found.covariances.information.covariance_of([alone, alone | by_error, by_error])
+    std, relative_std, error_std = (float(x) for x in np.sqrt(np.diag(P)) / DEG)
+    left = error_std / _stated_std(problem, lasting, by_error)
+    apart = message("heading_error.undetermined", left=100.0 * left) if left > _UNKNOWN else ""
     turn = in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value
     angle, key, named = -float(down @ turn), "heading_error.about_the_vertical", {}
     if np.linalg.norm(turn) > _LARGE_DEG:
@@ -61,6 +67,7 @@ def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Fin
         std=std,
         relative=angle - mean / DEG,
         relative_std=relative_std,
+        apart=apart,
     )
     yield Finding(Code.HEADING_ERROR, text, parameter=_MISALIGNMENT)
 
@@ -111,3 +118,19 @@ def _mean_error(
         mean += float(error[_HEADING])
         out |= {key: each[[_HEADING]] for key, each in by_node.items()}
     return mean, out
+
+
+def _stated_std(problem: Problem, lasting: Process | None, by_error: dict[int, Array]) -> float:
+    """Return the standard deviation, deg, that is stated of the mean error of the heading."""
+    variance = sum(
+        float(np.sum((by_error[problem.key(p.name)] * p.sigma) ** 2))
+        for p in problem.parameters
+        if problem.key(p.name) in by_error
+    )
+    if lasting is not None:
+        weight = np.array(
+            [by_error[lasting.key(j)][0, _HEADING] for j in range(lasting.time.size)]
+        )
+        apart = np.abs(lasting.time[:, None] - lasting.time)
+        variance += float(weight @ np.exp(-apart / lasting.tau[_HEADING]) @ weight)
+    return float(np.sqrt(variance)) / DEG

@@ -16,6 +16,7 @@ from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
+from factorgraph_dvl.plausibility.usbl import grid_north_findings
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import (
     consistency_findings,
@@ -76,6 +77,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     findings += heading_and_misalignment(trial, found)
+    findings += grid_north_findings(trial, estimates)
     return Solution(
         trial=trial.name,
         solver="batch",

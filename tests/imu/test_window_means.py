@@ -105,3 +105,23 @@ def test_windows_end_where_the_samples_do(moving):
     inc = chain.segments.increments
     edge = np.array([inc.start[0], inc.end[-1]])
     assert np.isfinite(windows(inc, edge, 1.0).mean.added).all()
+
+
+@pytest.mark.parametrize("length", [0.06, 0.08, SHORTEST, 0.17, 0.31])
+def test_derivatives_are_those_of_the_value_where_samples_are_noisy(length):
+    """Also inside a sample, and without a jump at the length up to which it is a straight line."""
+    noisy = scenario(
+        manoeuvres=SHORT,
+        sway=SWAY,
+        noise=True,
+        imu={"gyro_noise_deg_sqrt_h": 3.0, "accel_noise_ug_sqrt_hz": 3000.0},
+    )
+    moving = exact(noisy)
+    h = 1e-5
+    for at in (length - 2.0 * h, length + 2.0 * h):
+        ahead, behind = (motion(moving, TIME, at + sign * h) for sign in (1.0, -1.0))
+        found = motion(moving, TIME, at).mean
+        for value, by_length in (("v_n", "v_by_length"), ("omega_eb_b", "omega_by_length")):
+            change = (getattr(ahead, value) - getattr(behind, value)) / (2.0 * h)
+            size = np.abs(change).max()
+            np.testing.assert_allclose(getattr(found, by_length), change, atol=2e-3 * size)

@@ -200,7 +200,12 @@ def test_a_result_without_a_dvl_has_nothing_to_enter() -> None:
 
 def test_the_sum_of_mount_and_compass_comes_first() -> None:
     text = message(
-        "heading_error.about_the_vertical", angle=-1.5, std=0.3, relative=-1.4, relative_std=0.02
+        "heading_error.about_the_vertical",
+        angle=-1.5,
+        std=0.3,
+        relative=-1.4,
+        relative_std=0.02,
+        apart="",
     )
     own = calibration(alpha=np.array([0.0, 0.0, 1.5]))
     found = replace(

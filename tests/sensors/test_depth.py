@@ -26,6 +26,7 @@ SINKING = [{"straight_s": 10}, {"climb_m_s": -0.5, "to_height_m": -5}, {"straigh
 
 def scene(**changes):
     depth = {"rate_hz": 3, "phase_s": 0.1, "lever_arm_m": ARM, "sea_surface_height_m": 17.3}
+    depth |= {"scale_error": 0.01}
     return scenario(manoeuvres=SINKING, depth=depth, **changes)
 
 
@@ -36,7 +37,7 @@ def observed(scn):
     frame = LocalFrame(fix[0] - OFFSET_RAD, fix[1] + OFFSET_RAD, 0.0)
     (depth,) = trial.others
     (o,) = depth.observations(frame, "RFU")
-    values = {"sea_surface_height_m": np.array([17.3])}
+    values = {"sea_surface_height_m": np.array([17.3]), "depth_scale_error": np.array([0.01])}
     return exact_motion(plan_motion(scn), frame, o.time), o, values, depth
 
 
@@ -62,7 +63,11 @@ def test_jacobians():
             lambda h: residual(nRb=motion.nRb @ exp_so3(h)), 3, step=1e-3)),
         (lin.d_p, differentiate(lambda h: residual(p_n=motion.p_n + h), 3, step=1.0)),
         (lin.d_parameters["sea_surface_height_m"], differentiate(
-            lambda h: o.residual(motion, {"sea_surface_height_m": np.array([17.3]) + h}), 1)),
+            lambda h: o.residual(motion, values | {"sea_surface_height_m": np.array([17.3]) + h}),
+            1)),
+        (lin.d_parameters["depth_scale_error"], differentiate(
+            lambda h: o.residual(motion, values | {"depth_scale_error": np.array([0.01]) + h}),
+            1)),
     ):  # fmt: skip
         np.testing.assert_allclose(stated, numerical, atol=2e-6)
     assert np.abs(lin.d_theta).max() > 1.0
@@ -78,8 +83,9 @@ def test_depth_by_hand():
     motion = Motion(down, zero, zero, zero, zero, zero, zero)
     measured = np.array([6.5])
     o = DepthBelowSurface(np.zeros(1), measured, 0.1, np.array([2.0, 0.0, 0.0]), frame)
-    residual = o.residual(motion, {"sea_surface_height_m": np.array([15.0])})
-    np.testing.assert_allclose(residual, [[0.5]], atol=1e-8)
+    values = {"sea_surface_height_m": np.array([15.0]), "depth_scale_error": np.array([-0.02])}
+    # 7 m of water that is lighter than supposed look like 6.86 m.
+    np.testing.assert_allclose(o.residual(motion, values), [[0.36]], atol=1e-8)
 
 
 def test_noiseless_dive_is_exact():
@@ -96,6 +102,36 @@ def test_noiseless_dive_is_exact():
     solution = solve(trial)
     assert solution.estimate("sea_surface_height_m").observable.all()
     assert_exact(trial, solution, limit=0.1, trajectory=0.6)
+
+
+def test_scale_and_surface_of_a_slow_pressure_sensor_are_as_good_as_they_say():
+    """With fixes at the surface, and 30 m down: density off by 2 %, an offset over minutes."""
+    down = [{"climb_m_s": -0.5, "to_height_m": -30}, {"straight_s": 60}]
+    up = [{"climb_m_s": 0.5, "to_height_m": 10}, {"straight_s": 60}]
+    slow = {"scale_error_std": 0.02, "correlated_std_m": 0.2, "correlation_time_s": 200}
+    depth = {"rate_hz": 1, "std_m": 0.02, "sea_surface_height_m": 11.0, "scale_error": "draw"}
+    squares = []
+    for seed in range(4):
+        trial = simulate(
+            scenario(
+                noise=True,
+                manoeuvres=[{"straight_s": 60}, *down, *up],
+                start={"lat_deg": 36, "lon_deg": 121, "height_m": 10, "speed_m_s": 1.5},
+                gnss={"outages_s": [[60, 300]], "position_std_m": [0.1, 0.1, 0.1]},
+                dvl={"rate_hz": 2},
+                depth=depth | slow,
+            ),
+            seed,
+        )
+        solution = solve(trial, rate_hz=1.0)
+        e = solution.estimate("depth_scale_error")
+        assert e.std[0] < 0.01
+        for name in ("depth_scale_error", "sea_surface_height_m"):
+            e = solution.estimate(name)
+            squares.append((e.value - trial.calibration_truth[name])[0] ** 2 / e.std[0] ** 2)
+    assert np.max(squares) < 4.0**2
+    # The mean of eight, in 99 % of such tests.
+    assert 0.1 < np.mean(squares) < 2.8
 
 
 def test_without_gnss_the_sea_surface_is_not_observable():

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from truth import config
 
+from factorgraph_dvl import predict
 from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.usbl import Usbl
@@ -80,14 +81,16 @@ def test_gross_fixes_hardly_change_the_calibration():
         trial = simulate(config("dive-usbl"), seed)
         pair = [solve(t, rate_hz=1.0) for t in (trial, changed(trial, gross))]
         truth = trial.calibration_truth
+        std = {n: pair[0].estimate(n).std for n in DVL}
         errors.append(
             [
-                np.concatenate([(s.estimate(n).value - truth[n]) / s.estimate(n).std for n in DVL])
+                np.concatenate([(s.estimate(n).value - truth[n]) / std[n] for n in DVL])
                 for s in pair
             ]
         )
+        print(seed, [s.verdict.grade for s in pair])
     clean, dirty = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
-    print(f"RMS of error over σ: {clean:.2f}, with gross fixes {dirty:.2f}")
+    print(f"RMS of error over σ without gross fixes: {clean:.2f}, with them {dirty:.2f}")
     assert dirty <= 1.2 * clean
 
 
@@ -103,3 +106,32 @@ def test_a_transceiver_that_is_not_where_it_is_said_to_be_is_named():
     solution = solve(changed(simulate(config("dive-usbl"), 1), at_the_reference_point))
     reasons = {r.code: str(r) for r in solution.verdict.reasons}
     assert "usbl_transceiver_lever_arm_m" in reasons[Code.ESTIMATED_INSTEAD]
+
+
+@pytest.mark.slow
+@pytest.mark.study
+def test_without_imu_the_sum_of_compass_and_mount_is_as_good_as_its_bound():
+    attitude = {"rate_hz": 5, "std_deg": [0.2, 0.2, 0.2], "correlation_time_s": 300.0}
+    scene = config("dive-usbl", imu=None, attitude=attitude, trial={"imu": None})
+    bound = heading_error(predict(scene).solution)["relative_std"]
+    errors = []
+    for seed in range(SEEDS):
+        trial = simulate(scene, seed)
+        found = heading_error(solve(trial, rate_hz=1.0))
+        time, heading = trial.attitude.time, trial.attitude.rph[:, 2]
+        at = trial.reference
+        wrong = heading - np.interp(time, at.time, np.unwrap(at.rph[:, 2]))
+        wrong = (wrong + np.pi) % (2.0 * np.pi) - np.pi
+        mean = np.degrees(np.average(wrong, weights=np.gradient(time)))
+        errors.append(found["relative"] - (trial.calibration_truth["misalignment_deg"][2] - mean))
+        print(seed, errors[-1], found["relative_std"], bound)
+        assert found["relative_std"] < 1.2 * bound
+        assert found["apart"].key == "heading_error.undetermined"
+    low, high = nees_band(1, SEEDS, level=0.99)
+    assert low < np.mean(np.square(errors)) / bound**2 < high
+
+
+def heading_error(solution):
+    """Return the values of what is said of compass and mount."""
+    (note,) = (f for f in solution.findings if f.code == Code.HEADING_ERROR)
+    return dict(note.message.values)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from truth import LONGER_TURNS_AND_BRAKING, scenario
 
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
 
@@ -68,3 +72,17 @@ def test_transponders_are_found_between_fixes_at_the_surface(without_imu):
     check(solution, made.calibration_truth, [*names, "misalignment_deg", "lever_arm_m"])
     for name in names:
         assert np.all(solution.estimate(name).std[:2] < 1.0)
+
+
+def test_a_heading_of_the_ship_in_grid_north_is_named():
+    usbl = {"rate_hz": 1, "measures": "polar", "range_std_m": 0.1, "angle_std_deg": 0.1}
+    ship = SHIP | {"misalignment_deg": [0.02, -0.01, 0.03]}
+    made = simulate(trial(False, gnss=None, usbl={**usbl, "ship": ship}), seed=1)
+    # Grid north is 1.18 deg to the west of north, 2 deg west of the middle of UTM zone 51.
+    convergence = -np.arctan(np.tan(np.radians(2.0)) * np.sin(np.radians(36.0)))
+    record = made.find(Usbl)
+    turned = replace(record.ship, rph=record.ship.rph - [0.0, 0.0, convergence])
+    others = tuple(replace(a, ship=turned) if a is record else a for a in made.others)
+    for each, named in ((made, False), (replace(made, others=others), True)):
+        solution = solve(each, rate_hz=1.0)
+        assert (Code.USBL_GRID_NORTH in {f.code for f in solution.findings}) is named

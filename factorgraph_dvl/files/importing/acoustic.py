@@ -27,6 +27,8 @@ _SENTENCES = "nmea"
 _HEADING_STD = 1.0 * DEG
 # Chosen: time between records of the vessel, s, beyond which it is not known where it was.
 _LONGEST_STEP = 5.0
+# Share of the stated errors of fixes that is new in each, if they are independent. Chosen.
+_SMOOTH = 0.3
 
 
 def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> list[Timed]:
@@ -70,17 +72,50 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
     )
     first = places.streams[0].stream
     times: list[Array] = []
+    changes: list[Array] = []
+    stated: list[Array] = []
 
     def parts() -> Iterator[Records]:
         for time, fixes in _fixes(places, Beside(position), Beside(heading)):
             times.append(time)
+            changes.append(_changes_of_error(time, fixes))
+            stated.append(fixes["std"][:, 0])
             yield fixes
 
     records = spool.store(parts(), KINDS["fix"])
+    _judge(places.label, np.concatenate(changes), np.concatenate(stated), decisions)
     stream = Stream(
         first.file, first.format, "fix", "utc", first.stream, "", "unknown", (), records
     )
     return [*others, Timed.of(stream, times, spool)]
+
+
+def _changes_of_error(time: Array, fixes: Records) -> Array:
+    """Return how far fixes are from the middle of their neighbours, north and east, (M, 2), m.
+
+    Times a factor that makes it the standard deviation of errors that are new in each fix. Only
+    where the fixes before and after are near in time: so the motion adds hardly anything.
+    """
+    meridian, transverse = radii(fixes["lat"])
+    east = fixes["lon"] * transverse * np.cos(fixes["lat"])
+    place = np.stack([fixes["lat"] * meridian, east], axis=1)
+    near = (np.diff(time)[1:] < _LONGEST_STEP) & (np.diff(time)[:-1] < _LONGEST_STEP)
+    return np.diff(place, 2, axis=0)[near] / np.sqrt(6.0)
+
+
+def _judge(label: str, changes: Array, stated: Array, decisions: Decisions) -> None:
+    """Say how much of the stated errors of fixes is new in each of them."""
+    changes, stated = (x[np.isfinite(x)] for x in (changes, stated))
+    if not (changes.size and stated.size):
+        return
+    # Of a Gaussian, the median of the size is 0.6745 σ.
+    found, std = float(np.median(np.abs(changes))) / 0.6745, float(np.median(stated))
+    text = f"from one fix to the next, errors differ by {found:.2g} m; stated are {std:.2g} m"
+    if found < _SMOOTH * std:
+        text += (
+            " → smoothed, or errors that last; a DVL and attitude of that time would show which"
+        )
+    decisions.add(label, text, "usbl.position_std_m")
 
 
 def _with_vessel(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:

@@ -18,6 +18,7 @@ import pytest
 import yaml
 from running import run  # noqa: F401
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.files.formats import rowe
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.format import Batch, empty
@@ -26,6 +27,7 @@ from factorgraph_dvl.files.importing.account import Account
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.tables import read_table
+from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import rotate
 
@@ -298,6 +300,14 @@ class TestRecordings:
         new = [i for i, row in enumerate(contents) if not i or row != contents[i - 1]]
         valid = [i for i in new if tables[0][i]["position_valid"] == "True"]
         assert found[0]["locator (acoustic)"] == (len(valid), len(new) - len(valid))
+        # By the file, errors are of metres; they change by a tenth of a metre.
+        text = decisions.text("")
+        assert "from one fix to the next, errors differ by 0.13 m; stated are 3.5 m" in text
+        assert "smoothed, or errors that last" in text
+        lacks = [line for line in decisions.missing if "no file has" in line]
+        assert [line.partition(":")[0] for line in lacks] == ["velocities", "attitude"]
+        with pytest.raises(ConfigError, match="positions alone have nothing to calibrate"):
+            load_trial(tmp_path / "trial")
         assert found[0]["row"] == (0, len(contents) - len(new))
         assert found[1] == {"position (topside)": (len(tables[1]), 0)}
         assert found[2] == {"orientation of the housing": (0, len(tables[2]))}

@@ -11,6 +11,7 @@ from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.geometry.earth import radii
+from factorgraph_dvl.sensors.usbl import Usbl, UsblSettings
 
 DEG = np.pi / 180.0
 
@@ -118,3 +119,21 @@ def test_positions_by_the_example_of_the_document(tmp_path):
     np.testing.assert_allclose(lat, 43.0 + 5.25355 / 60.0)
     np.testing.assert_allclose(lon, 6.0 + 31.76852 / 60.0)
     np.testing.assert_allclose(height, -1013.1)
+
+
+def test_fixes_of_a_vehicle_that_come_as_gga_serve_as_those_of_a_usbl(tmp_path):
+    """Its section takes the table of `gnss` as it is."""
+    lines = []
+    for k in range(20):
+        at = f"1200{k:02d}.00"
+        lines += [
+            writers.nmea(f"GPZDA,{at},01,06,2023,00,00"),
+            writers.nmea(f"GPGGA,{at},5400.0000,N,00300.0000,W,4,12,0.6,-30.0,M,50.0,M,,"),
+        ]
+    (tmp_path / "rov.log").write_bytes(b"".join(lines))
+    import_files([tmp_path / "rov.log"], tmp_path / "trial")
+    table = read_table(tmp_path / "trial" / "gnss.parquet", Usbl.required, Usbl.optional)
+    usbl = Usbl.from_columns(UsblSettings(), table, "rov.log")
+    assert not usbl.missing.any()
+    np.testing.assert_allclose(usbl.geodetic[:, 2], 20.0)
+    assert np.isfinite(usbl.position_std).all()
