@@ -66,8 +66,8 @@ class Partial:
     alpha_sigma, force_sigma : ndarray, shape (M,)
         Standard deviation of alpha and force from noise.
     vibration, moving : ndarray, shape (M, 3), optional
-        By how much attitude and position change faster at the end than omega and dv say, rad/s and
-        m/s: the rate is smoothed, and the increments are those of the samples.
+        Rates at which attitude and position change at the end, less omega and dv, rad/s and m/s:
+        the rate is smoothed, and the increments are those of the samples.
     """
 
     phi: Array

@@ -66,8 +66,8 @@ class Attachment:
     turn : ndarray, shape (M, 3, 3)
         Exp(-earth_rate tau).
     vibration, moving : ndarray, shape (M, 3), optional
-        By how much attitude and position change faster than gyro and dV say, rad/s in the axes at
-        the time, and m/s in those at the node.
+        Rates at which attitude and position change, less gyro and dV, rad/s in the axes at the
+        time, and m/s in those at the node.
     """
 
     segment: IntArray

@@ -73,7 +73,7 @@ class Motion:
     vibration_b : ndarray, shape (M, 3), optional
         Rate of the attitude that omega_eb_b leaves out, rad/s.
     moving_n : ndarray, shape (M, 3), optional
-        By how much the position changes faster than v_n says, m/s.
+        Rate at which the position changes, less v_n, m/s.
     mean : MeanMotion, optional
         How v_n and omega_eb_b depend on the motion, where they are means over windows.
     """
