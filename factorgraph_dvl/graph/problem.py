@@ -202,16 +202,10 @@ class Problem:
         return {p.name: prior_mean(p) for p in self.all_parameters}
 
     def values(self, states: Any, parameters: dict[str, Array]) -> gtsam.Values:
-        """Return GTSAM's values of states and parameters.
-
-        Nodes of a process that had others before start without an error.
-        """
+        """Return GTSAM's values of states and parameters."""
         out = self.chain.values(states)
         for process in self.processes:
-            nodes = parameters.get(process.name)
-            if nodes is None or len(nodes) != process.time.size:
-                nodes = process.zero
-            for j, node in enumerate(nodes):
+            for j, node in enumerate(process.nodes_of(parameters)):
                 out.insert(process.key(j), node)
         for p in self.parameters:
             value = parameters[p.name]

@@ -7,7 +7,7 @@ that walks is one more component of the nodes, with a correlation time of severa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -120,6 +120,11 @@ class Process:
     def zero(self) -> Array:
         """Nodes without an error, (J, size)."""
         return np.zeros((self.time.size, self.size))
+
+    def nodes_of(self, values: Mapping[str, Array]) -> Array:
+        """Return its nodes (J, size) among values by name: without an error if it had others."""
+        nodes = values.get(self.name, self.zero)
+        return nodes if len(nodes) == self.time.size else self.zero
 
     def place(self, time: Array) -> tuple[IntArray, Array]:
         """Return the nodes before times (M,), and the weights of the nodes after them."""
