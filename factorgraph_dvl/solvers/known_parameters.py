@@ -30,7 +30,7 @@ from factorgraph_dvl.statistics.scores import Score, Scores, scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
-_LOG10_P = -4.0
+_LOG10_P = -6.0
 # Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
 # the cause.
 _FAR = 4.0
