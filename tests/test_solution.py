@@ -53,7 +53,7 @@ def test_summary_and_html_have_every_component(solution):
         assert "good" in text
         for name in ("misalignment_z", "scale_error", "lever_arm_x", "dvl_bias_z"):
             assert name in text
-        assert "19.997 ± 0.021" in text
+        assert "19.998 ± 0.021" in text
     assert max(map(len, solution.summary().splitlines())) <= 80
 
 

@@ -69,7 +69,7 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
 def grid_north_findings(trial: Trial, estimates: Sequence[Estimate]) -> Iterator[Finding]:
     """Yield that the transceiver is turned as a heading in grid north makes it look, if it is.
 
-    Nothing else tells the two apart: grid north is where the mount may be, too.
+    Nothing else distinguishes the two: grid north is where the mount may be, too.
     """
     usbl = trial.find(Usbl)
     found = {e.name: e for e in estimates}.get(_MISALIGNMENT)

@@ -27,7 +27,7 @@ _LARGE_DEG = 15.0
 # Horizontal part of an axis that has a bearing. Chosen: at least one axis has more.
 _LEVEL = 0.5
 # Share of the stated standard deviation of the mean heading error from which on the data do not
-# tell it. Chosen: as that of directions that are left to the prior.
+# show it. Chosen: as that of directions that are left to the prior.
 _UNKNOWN = 0.8
 
 
