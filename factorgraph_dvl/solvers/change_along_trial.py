@@ -10,7 +10,7 @@ import numpy as np
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.sensors.imu import ERRORS
+from factorgraph_dvl.sensors.imu import BIASES, ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
@@ -136,10 +136,11 @@ def change_findings(
         others = message("changed_along_trial.others", names=[t.name for t in ties])
     # What changes is either calibrated, or moves what is.
     moves = [(best, change.size)]
-    if best.parameter.name not in limits:
+    # A clock or an antenna that jumps is a fault of the record, whatever it moves.
+    if best.parameter.name in BIASES:
         shifts = zip(tests, change.shift, strict=True)
         moves = [(t, by) for t, by in shifts if t.parameter.name in limits]
-    small = bool(moves) and all(abs(by) < limits[t.parameter.name] for t, by in moves)
+    small = bool(moves) and all(abs(by) < limits.get(t.parameter.name, 0.0) for t, by in moves)
     said = "changed_along_trial.changes"
     if small and best.parameter.name in limits:
         said = "changed_along_trial.drifts"
