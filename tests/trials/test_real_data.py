@@ -75,14 +75,15 @@ def test_a_car_is_smoothed_from_positions_alone(kitti):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="biases of the IMU walk instead: noise starts with a time of 100 s")
 def test_what_the_stated_noise_does_not_explain_is_said(kitti):
-    """The noise is that of GTSAM's own example; it is larger, and it persists for seconds."""
+    """The noise is that of GTSAM's own example: biases of the IMU walk more than it says."""
     _, solution = kitti
-    (text,) = of_code(solution.findings, Code.LARGE_RESIDUALS)
-    assert "residuals are 1.4" in text
+    texts = of_code(solution.findings, Code.ESTIMATED_INSTEAD)
+    for name in ("gyro_bias_walk_deg_h_sqrt_h", "accel_bias_walk_ug_sqrt_h"):
+        assert any(name in text for text in texts), name
+    # With these, fixes scatter no more than is stated.
     (noise,) = solution.noise
-    assert np.all(noise.correlation_time < 10.0)
+    assert np.all(noise.factor < 1.0)
     assert of_code(solution.findings, Code.UNUSED)
 
 
