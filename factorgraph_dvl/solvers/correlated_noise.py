@@ -206,8 +206,7 @@ def _with_unseen(
     if process is not None:
         missing = np.where(own, missing, process.sigma)
         tau = np.where(own, tau, process.tau)
-    active = missing > 0.0
-    nodes = node_times(time, float(tau[active].min()), missing[active], sigma[active])
+    nodes = _node_times(time, missing, tau, sigma)
     return Process(o.label, index, missing, tau, nodes, least_sigma=missing)
 
 
@@ -221,6 +220,12 @@ def _walking(
         nodes = node_times(time, tau, most, sigma)
         process = Process(label, index, np.zeros(sigma.size), np.ones(sigma.size), nodes)
     return replace(process, walk=walk)
+
+
+def _node_times(time: Array, sigma: Array, tau: Array, white: Array) -> Array:
+    """Return times of nodes that serve all components (d,) that have a deviation."""
+    active = sigma > 0.0
+    return node_times(time, float(tau[active].min()), sigma[active], white[active])
 
 
 def _typical(weight: Array) -> Array:
@@ -309,9 +314,7 @@ def _model(
         return None, white, inflation
     active = process_sigma > 0.0
     tau[~active] = tau[active].max()
-    nodes = node_times(
-        time, float(tau[active].min()), process_sigma[active], (sigma * white)[active]
-    )
+    nodes = _node_times(time, process_sigma, tau, sigma * white)
     least = process_sigma if density_only else None
     process = Process(o.label, index, process_sigma, tau, nodes, least)
     return process, white, inflation
@@ -337,18 +340,12 @@ def with_closer_nodes(process: Process, problem: Problem, change: Mapping[str, A
     change : mapping of str to ndarray
         Factors (d,) on the white noise of each label, relative to what is applied.
     """
-    active = process.sigma > 0.0
     labels = [o.label for o in problem.observations]
-    if process.label not in labels or not active.any():
+    if process.label not in labels or not process.sigma.any():
         return process
     i = labels.index(process.label)
-    white = _typical(problem.weights[i]) * change.get(process.label, np.ones(active.size))
-    nodes = node_times(
-        _used_time(problem, i),
-        float(process.tau[active].min()),
-        process.sigma[active],
-        white[active],
-    )
+    white = _typical(problem.weights[i]) * change.get(process.label, 1.0)
+    nodes = _node_times(_used_time(problem, i), process.sigma, process.tau, white)
     if nodes.size < _CLOSER * process.time.size:
         return process
     return replace(process, time=nodes)

@@ -228,7 +228,11 @@ def minimise(
         elif promised < _WITHIN and damping == 0.0 and held:
             settled = True
             break
-        elif damping == 0.0 and _within(problem, promised, root, delta, proven=proven):
+        elif (
+            damping == 0.0
+            and (root is not None or not proven)
+            and _within(problem, promised, root, delta)
+        ):
             return Minimum(evaluation, root, True, iteration)
         elif not careful and root is None:
             # The step may have been bad for want of digits only.
@@ -242,7 +246,7 @@ def minimise(
     root = eliminated(gaussian, problem.ordering(branches=False), sizes)
     delta = root.solution()
     promised = _promised(problem, evaluation, gaussian, delta)
-    settled = settled or _within(problem, promised, root, delta, proven=True)
+    settled = settled or _within(problem, promised, root, delta)
     return Minimum(evaluation, root, settled, iteration)
 
 
@@ -251,13 +255,9 @@ def _within(
     promised: float,
     root: SquareRootInformation | None,
     delta: gtsam.VectorValues,
-    *,
-    proven: bool,
 ) -> bool:
     """Whether a step promises hardly anything, and would move no constant that is reported."""
-    if root is None:
-        return promised < _WITHIN and not proven
-    if promised < _WITHIN or promised > _LITTLE or not problem.parameters:
+    if root is None or promised < _WITHIN or promised > _LITTLE or not problem.parameters:
         return promised < _WITHIN
     step = np.concatenate([delta.at(problem.key(name)) for name in problem.columns])
     variance = np.diag(root.covariance_of([every_constant(problem)]))

@@ -36,9 +36,7 @@ from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
-from factorgraph_dvl.statistics.variance_components import (
-    variance_components,
-)
+from factorgraph_dvl.statistics.variance_components import variance_components
 
 # Shares of a change of noise that are tried in turn. Chosen: what is left changes no σ.
 _SHARES = (1.0, 0.5, 0.25, 0.125)
