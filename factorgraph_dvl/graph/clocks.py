@@ -73,7 +73,9 @@ def linearized(
 
     With the lag o + r (t - t0) of the stamps,
 
-        dρ/do = -(dρ/dθ ω_eb + dρ/dp v + dρ/dv a + dρ/dω α),    dρ/dr = (t - t0) dρ/do.
+        dρ/do = -(dρ/dθ ω_eb + dρ/dp v + dρ/dv a + dρ/dω α),    dρ/dr = (t - t0) dρ/do,
+
+    and a delay of some measurements beside their clock has the same derivative as its offset.
 
     Nodes that move with a clock of lag n have dρ/dn = -dρ/do, for all measurements; where their
     attitudes have a clock of their own, each of both takes its terms.
@@ -121,7 +123,7 @@ def linearized(
             else by_change((lin.d_v, mean.v_by_length), (lin.d_omega, mean.omega_by_length))
         )
     since = (observation.time - zero)[:, None, None]
-    for name, by in zip(own, (-by_time, -by_time * since), strict=False):
+    for name, by in zip(own, (-by_time, -by_time * since, -by_time), strict=False):
         if name in wanted:
             # A measurement from another vessel knows itself how that one moves.
             found[name] = found.get(name, 0.0) + by

@@ -48,7 +48,8 @@ def clock_findings(
     span : float
         Length of its record, s.
     """
-    mean, std = sensor.settings.time_offset_s, sensor.settings.time_offset_std_s
+    mean, std = sensor.settings.velocity_lag_s
+    delay = mean - sensor.settings.time_offset_s
     if clock.gain < _LEAST_GAIN:
         return
     change = clock.rate * span
@@ -81,12 +82,14 @@ def clock_findings(
         yield Finding(
             Code.CLOCK_OFFSET,
             message(
-                "clock_offset.late" if clock.offset > 0 else "clock_offset.early",
-                size=abs(clock.offset),
+                "clock_offset.late" if clock.offset > delay else "clock_offset.early",
+                size=abs(clock.offset - delay),
                 std=max(clock.sigma, 0.005),
-                instead="" if mean == 0.0 else message("clock_offset.instead", stated=mean),
+                instead=""
+                if mean == delay
+                else message("clock_offset.instead", stated=mean - delay),
                 section=sensor.section,
-                offset=clock.offset,
+                offset=clock.offset - delay,
             ),
             sensor.label,
             severity="error" if abs(off) > max(_COVERED * std, _HARMLESS_S) else "warning",

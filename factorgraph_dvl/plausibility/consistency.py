@@ -170,7 +170,7 @@ def _stands_out(view: _GnssView | _DvlView) -> bool:
 
 
 def _stated(sensor: Gnss | Dvl) -> float:
-    return sensor.settings.time_offset_s
+    return sensor.settings.velocity_lag_s[0]
 
 
 def _compared(

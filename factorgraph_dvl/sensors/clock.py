@@ -34,6 +34,11 @@ class ClockSection(SensorSection, frozen=True, kw_only=True):
     time_offset_std_s: NonNegative = 0.0
     clock_rate_std_ppm: NonNegative = 0.0
 
+    @property
+    def velocity_lag_s(self) -> tuple[float, float]:
+        """What stamps of velocities are late by, and its standard deviation, s."""
+        return self.time_offset_s, self.time_offset_std_s
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -62,7 +67,7 @@ class Clock:
         return cls(offset, rate)
 
     @cached_property
-    def names(self) -> tuple[str, str]:
+    def names(self) -> tuple[str, ...]:
         """Names of offset and rate."""
         return self.offset.name, self.rate.name
 
@@ -97,6 +102,30 @@ class Clock:
         """
         offset, rate = float(values[self.offset.name][0]), float(values[self.rate.name][0])
         return offset + rate * (time - zero)
+
+
+@dataclass(frozen=True)
+class LateClock(Clock):
+    """The clock of measurements that may be late beside the others of their sensor.
+
+    Parameters
+    ----------
+    offset, rate : ParameterSpec
+        Offset, s, and rate, ppm, of the sensor's clock.
+    delay : ParameterSpec
+        What their stamps are late by, s, beside the offset.
+    """
+
+    delay: ParameterSpec
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of offset, rate and delay."""
+        return self.offset.name, self.rate.name, self.delay.name
+
+    def lag(self, time: Array, values: Mapping[str, Array], zero: float) -> Array:
+        """Return stamps minus true times, (M,), s; arguments are those of `Clock.lag`."""
+        return super().lag(time, values, zero) + float(values[self.delay.name][0])
 
 
 def on_shared_clocks(parameters: Iterable[Parameter], aids: Sequence[Aid]) -> list[Parameter]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Self
@@ -16,8 +17,8 @@ from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
-from factorgraph_dvl.sensors.clock import Clock, ClockSection
-from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
+from factorgraph_dvl.sensors.clock import Clock, ClockSection, LateClock
+from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     USUAL_CORRELATION_TIME,
     Motion,
@@ -54,6 +55,11 @@ _VELOCITY_TIME = 2.0
 _AT_REST = np.zeros(3)
 _AT_REST.setflags(write=False)
 _CLOCK = Clock.of("gnss", prefix="gnss_")
+# Plausible delay, s. Chosen: half the window of differences of positions, or a filter's.
+_DELAY = ParameterSpec(
+    "gnss_velocity_delay", "s", labels=SCALAR, nuisance=True, plausible=0.5, of_record=True
+)
+_VELOCITY_CLOCK = LateClock(_CLOCK.offset, _CLOCK.rate, _DELAY)
 TIME_OFFSET = _CLOCK.offset.name
 
 
@@ -77,6 +83,14 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
     correlated_std_m: Sigma3 | UnsetType = UNSET
     velocity_correlation_time_s: Positive | UnsetType = UNSET
     correlated_velocity_std_m_s: Sigma3 | UnsetType = UNSET
+    velocity_delay_s: float = 0.0
+    velocity_delay_std_s: NonNegative = 0.0
+
+    @property
+    def velocity_lag_s(self) -> tuple[float, float]:
+        """What stamps of velocities are late by, and its standard deviation, s."""
+        std = math.hypot(self.time_offset_std_s, self.velocity_delay_std_s)
+        return self.time_offset_s + self.velocity_delay_s, std
 
 
 @dataclass(frozen=True)
@@ -130,7 +144,7 @@ class Gnss:
         POSITION_STD_COLUMNS,
         VELOCITY_STD_COLUMNS,
     )
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM, *_CLOCK.specs)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM, *_CLOCK.specs, _DELAY)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -227,10 +241,15 @@ class Gnss:
         return bRc @ np.array(self.settings.lever_arm_m), omega_cb_b
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the antenna's lever arm, and offset and rate of the receiver's clock."""
+        """Return the antenna's lever arm, the receiver's clock, and the delay of velocities."""
         s = self.settings
         lever_arm = Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m))
-        return (lever_arm, *_CLOCK.parameters(s))
+        delay, std = s.velocity_delay_s, s.velocity_delay_std_s
+        return (
+            lever_arm,
+            *_CLOCK.parameters(s),
+            Parameter(_DELAY, np.array([delay]), np.array([std])),
+        )
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return position and velocity measurements, where there are any."""
@@ -278,7 +297,7 @@ class Gnss:
                     lRn=lRn[m],
                     std=self.velocity_std[m],
                     label="GNSS velocity",
-                    clock=_CLOCK,
+                    clock=_VELOCITY_CLOCK,
                     lever_arm=LEVER_ARM,
                     bRc=bRc,
                     omega_cb_b=omega_cb_b,
@@ -295,6 +314,6 @@ class Gnss:
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component of the lever arm or the clock could not be observed."""
-        if parameter in _CLOCK.names:
+        if parameter in _VELOCITY_CLOCK.names:
             return message("not_observable.clock")
         return message("not_observable.antenna")

@@ -154,8 +154,8 @@ class SensorClock(Protocol):
     """What the stamps of a sensor depend on."""
 
     @property
-    def names(self) -> tuple[str, str]:
-        """Names of the parameters offset and rate."""
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters offset and rate, and of a delay if there is one."""
 
     def lag(self, time: Array, values: Values, zero: float) -> Array:
         """Return stamps minus true times, (M,), s."""

@@ -115,11 +115,14 @@ def simulate_gnss(
     # The antenna is on the ship, even if a turntable turns the IMU.
     state = motion.ship_at(time)
     nRs = rotation_from_rph(state.rph, scenario.body_axes)
-    arm_n = apply(nRs, np.array(truth.lever_arm_m))
+    position, arm_n = state.geodetic, apply(nRs, np.array(truth.lever_arm_m))
+    if truth.velocity_delay_s:
+        state = motion.ship_at(np.clip(time - truth.velocity_delay_s, 0.0, motion.duration))
+        nRs = rotation_from_rph(state.rph, scenario.body_axes)
     velocity = state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
     white = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
     error = np.sqrt(1.0 - truth.correlated_share) * white
-    geodetic = displaced(state.geodetic, arm_n + error if scenario.noise else arm_n)
+    geodetic = displaced(position, arm_n + error if scenario.noise else arm_n)
     if truth.velocity_std_m_s is None:
         velocity = np.full_like(velocity, np.nan)
     elif scenario.noise:
@@ -135,9 +138,11 @@ def simulate_gnss(
         position_std=unknown,
         velocity_std=unknown.copy(),
     )
+    late = truth.velocity_delay_s
     return gnss, {
         "gnss_lever_arm_m": np.array(truth.lever_arm_m),
         "gnss_time_offset_s": np.zeros(1),
+        **({"gnss_velocity_delay_s": np.array([late])} if late else {}),
     }
 
 

@@ -9,12 +9,13 @@ import numpy as np
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.graph.inertial_chain import WALK
+from factorgraph_dvl.graph.inertial_chain import WALK, InertialChain
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, squares_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
@@ -86,11 +87,11 @@ def bias_walks(
     prepared : Preparation
         What was minimised, with the IMU as it is stated.
     problem : Problem
-        The same, with noise as residuals ask for.
+        The same, with noise as stated, or as residuals ask for.
     minimum : Minimum
         Where it ended.
     noise : mapping of str to ndarray
-        Factors (d,) of each label on the noise of sensors: 1 where it is as stated.
+        Factors (d,) of each label on the stated noise of sensors, up to 1.
     report : callable
         Called with stage, iteration and cost.
     """
@@ -98,14 +99,75 @@ def bias_walks(
     imu = prepared.trial.inertial
     walking = [bias for name, bias in _WALKS.items() if getattr(imu.settings, name) > 0.0]
     sources = [*IMU_NOISE, *map(WALK.format, walking)]
-    if not _is_not_noise(*_squares(problem, minimum.evaluation, information, sources)):
+    squares, freedom = _squares(problem, minimum.evaluation, information, sources)
+    if not _is_not_noise(squares, freedom) and not _change(problem, minimum, information):
+        return None
+    start = minimum.evaluation
+    largest = _walked(prepared, problem, start, _START, noise, report)
+    if largest is None or not (largest.fits or largest.grows):
+        # With smaller walks sensors fit even less.
         return None
     found = [
-        _with_walks(prepared, problem, minimum.evaluation, names, noise, report)
+        _with_walks(prepared, problem, start, names, noise, report)
         for names in (*([name] for name in _WALKS), list(_WALKS))
     ]
     possible = [each for each in found if each is not None]
     return min(possible, key=lambda each: each.against, default=None)
+
+
+@dataclass(frozen=True)
+class _Walked:
+    """The minimum with some walks, and by how much each is too small there."""
+
+    prepared: Preparation
+    chain: InertialChain
+    problem: Problem
+    minimum: Minimum
+    ratios: dict[str, float]
+
+    @property
+    def fits(self) -> bool:
+        """Whether all sensors fit."""
+        return _fits(self.problem, self.minimum.evaluation)
+
+    @property
+    def grows(self) -> bool:
+        """Whether a walk is too small."""
+        return max(self.ratios.values()) > 1.0
+
+
+def _walked(
+    prepared: Preparation,
+    problem: Problem,
+    start: Evaluation,
+    walks: Mapping[str, float],
+    noise: Mapping[str, Array],
+    report: Progress,
+) -> _Walked | None:
+    """Return the minimum with walks of some biases; None if there is none."""
+    walking = prepared.with_imu(**walks)
+    chain = walking.chain(start.states)
+    test = Problem(
+        chain,
+        problem.observations,
+        problem.all_parameters,
+        start=start.parameters,
+        clock_zero=problem.clock_zero,
+        tilt=problem.tilt,
+    )
+    test.reject(problem.rejected)
+    test.noise_factors = noise
+    test.robust_weights = problem.robust_weights
+    at = test.values(start.states, test.prior_values() | start.parameters)
+    minimum = minimise(test, at, stage="walking biases", progress=report)
+    if not minimum.converged:
+        return None
+    ratios = {}
+    for name in walks:
+        own = [WALK.format(_WALKS[name])]
+        squares, freedom = _squares(test, minimum.evaluation, minimum.information, own)
+        ratios[name] = float(np.sqrt((squares + 1.0) / (max(freedom, 0.0) + 1.0)))
+    return _Walked(walking, chain, test, minimum, ratios)
 
 
 def _with_walks(
@@ -120,45 +182,26 @@ def _with_walks(
     stated = prepared.trial.inertial.settings
     walks = {name: _START[name] for name in names}
     for _ in range(_ESTIMATES):
-        walking = prepared.with_imu(**walks)
-        chain = walking.chain(evaluation.states)
-        test = Problem(
-            chain,
-            problem.observations,
-            problem.all_parameters,
-            start=evaluation.parameters,
-            clock_zero=problem.clock_zero,
-            tilt=problem.tilt,
-        )
-        test.reject(problem.rejected)
-        test.noise_factors = noise
-        test.robust_weights = problem.robust_weights
-        at = test.values(evaluation.states, test.prior_values() | evaluation.parameters)
-        minimum = minimise(test, at, stage="walking biases", progress=report)
-        if not minimum.converged:
+        found = _walked(prepared, problem, evaluation, walks, noise, report)
+        if found is None:
             return None
-        evaluation = minimum.evaluation
-        ratios = {}
-        for name in names:
-            own = [WALK.format(_WALKS[name])]
-            squares, freedom = _squares(test, evaluation, minimum.information, own)
-            ratios[name] = float(np.sqrt((squares + 1.0) / (max(freedom, 0.0) + 1.0)))
-        if max(abs(ratio - 1.0) for ratio in ratios.values()) < _SAME_WALK:
+        at, evaluation = found, found.minimum.evaluation
+        if max(abs(ratio - 1.0) for ratio in at.ratios.values()) < _SAME_WALK:
             break
-        walks = {name: walk * ratios[name] for name, walk in walks.items()}
-    squares, freedom = _squares(test, evaluation, minimum.information, IMU_NOISE)
+        if not (at.fits or at.grows):
+            return None
+        walks = {name: walk * at.ratios[name] for name, walk in walks.items()}
+    information = at.minimum.information
+    squares, freedom = _squares(at.problem, evaluation, information, IMU_NOISE)
     least = min(walks[name] / max(getattr(stated, name), 1e-12) for name in names)
-    if not _fits(test, evaluation) or _is_not_noise(squares, freedom) or least < _AS_STATED:
+    if not at.fits or _is_not_noise(squares, freedom) or least < _AS_STATED:
         return None
-    steps = np.log(chain.bias_steps).sum()
+    steps = np.log(at.chain.bias_steps).sum()
     against = (
-        _PER_WALK * len(names)
-        + evaluation.cost
-        + 0.5 * minimum.information.log_determinant
-        + float(steps)
+        _PER_WALK * len(names) + evaluation.cost + 0.5 * information.log_determinant + float(steps)
     )
     findings = tuple(_finding(name, walks[name], stated) for name in names)
-    return BiasWalks(walking, evaluation, against, findings)
+    return BiasWalks(at.prepared, evaluation, against, findings)
 
 
 def _squares(
@@ -172,6 +215,12 @@ def _squares(
         [*squares_of(problem, evaluation, information, sources).values()], axis=0
     )
     return float(squares), float(freedom)
+
+
+def _change(problem: Problem, minimum: Minimum, information: SquareRootInformation) -> bool:
+    """Whether a bias of the IMU changes along the trial."""
+    tests = component_changes(problem, minimum.evaluation, information)
+    return any(t.parameter.name in BIASES and t.change.chi2 > CHANGED**2 for t in tests)
 
 
 def _is_not_noise(squares: float, freedom: float) -> bool:

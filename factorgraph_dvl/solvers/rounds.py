@@ -32,6 +32,7 @@ from factorgraph_dvl.solvers.steps import (
     GrossErrors,
     ImuNoise,
     KnownParameters,
+    KnownParametersAgain,
     MotionStrengths,
     Noise,
     Proposal,
@@ -108,7 +109,7 @@ def settle(
     walks = Walks(report, known)
     steps: list[Step] = [
         MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,
-        Noise(), ImuNoise(), Uncorrelated(), walks,
+        Noise(), ImuNoise(), Uncorrelated(), KnownParametersAgain(known), walks,
     ]  # fmt: skip
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:

@@ -48,6 +48,9 @@ _MOST_FREED = 2
 # Variance of the scores, beside that of white noise, that a change may leave to explain what looks
 # like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
 _MOST_SCATTER = 20.0
+# Fall of the objective from which on tests of what was stated as known are made again. Chosen: as
+# much as the most that chance makes of them.
+_KNOWN_BETTER = 30.0
 # Searches for gross errors. Chosen: the second finds those that the first could not see.
 _SEARCHES = 2
 
@@ -304,14 +307,21 @@ class KnownParameters:
     first: Estimated | None = None
     freed: list[Explanation] = field(default_factory=list)
     left: Explanation | None = None
+    tested_at: float = np.inf
     _tested: _Asked = field(default_factory=_Asked)
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the most probable of these, with noise as stated and as found."""
+        if at.minimum.converged and not self._tested.before(at.model.parameters):
+            yield from self.tested(at)
+
+    def tested(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the same, also where parameters are those that were tested."""
         model = at.model
-        if not at.minimum.converged or self._tested.before(model.parameters):
-            return
         self._tested.note(model.parameters)
+        self.tested_at = at.objective
+        # A step may have taken a parameter back to what was stated.
+        self.freed = [c for c in self.freed if all(p is not c.parameter for p in model.parameters)]
         self.left = found = _explained(at)
         if len(self.freed) >= _MOST_FREED:
             return
@@ -328,9 +338,44 @@ class KnownParameters:
         found = model.robust_weights or model.processes != model.stated_processes
         if first is None or first.model.parameters is not model.parameters or not found:
             return None
-        if not first.model.is_applied(first.problem):
-            first.model.applied(first.problem)
-        return _explained(first)
+        return _explained(_applied(first))
+
+
+@dataclass
+class KnownParametersAgain:
+    """What was stated as known, once noise is known better: what shows now, and what no more.
+
+    Parameters
+    ----------
+    known : KnownParameters
+        The step that tested them first.
+    """
+
+    known: KnownParameters
+    name = KnownParameters.name
+    _asked: _Asked = field(default_factory=_Asked)
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield what takes a parameter back to what was stated, then what estimates another."""
+        model = at.model
+        if not at.minimum.converged or self.known.tested_at - at.objective < _KNOWN_BETTER:
+            return
+        if not self._asked.before(model.parameters, model.processes):
+            self._asked.note(model.parameters, model.processes)
+            for cause in self.known.freed:
+                stated = cause.parameter
+                parameters = tuple(
+                    stated if p.name == stated.name else p for p in model.parameters
+                )
+                yield _from(at, parameters=parameters)
+        yield from self.known.tested(at)
+
+
+def _applied(at: Estimated) -> Estimated:
+    """Return a minimum whose problem has its weights."""
+    if not at.model.is_applied(at.problem):
+        at.model.applied(at.problem)
+    return at
 
 
 def _explained(at: Estimated) -> Explanation | None:
@@ -434,17 +479,25 @@ class Walks:
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield walks where a sensor does not fit at all, and nothing else explains it."""
-        model, prepared = at.model, at.model.prepared
         if (
             self._tried
-            or not isinstance(prepared, Preparation)
+            or not isinstance(at.model.prepared, Preparation)
             or self.known.left is not None
-            or not _misfit(at.problem)
         ):
             return
+        # Biases that are not those of an earlier calibration look as if they walked away from it.
+        if at.model.prepared.trial.inertial.prior is not None and not _misfit(at.problem):
+            return
         self._tried = True
-        stated = {label: np.ones(f.size) for label, f in model.noise_factors.items()}
-        found = bias_walks(prepared, at.problem, at.minimum, stated, self.report)
+        # A walk explains what is beyond the noise that is stated.
+        noise = {label: np.minimum(f, 1.0) for label, f in at.model.noise_factors.items()}
+        first = self.known.first
+        if first is not None and (self.known.freed or _labels(at.model) != _labels(first.model)):
+            # Lasting noise or a freed parameter may have taken the place of a walk.
+            at = _applied(first)
+        model, prepared = at.model, at.model.prepared
+        assert isinstance(prepared, Preparation)
+        found = bias_walks(prepared, at.problem, at.minimum, noise, self.report)
         if found is None:
             return
         there = found.evaluation
@@ -452,7 +505,13 @@ class Walks:
         reference = there.states, there.parameters
         self.findings = found.findings
         yield Proposal(
-            replace(model.as_stated(), prepared=found.prepared, chain=chain, reference=reference),
+            replace(
+                model.as_stated(),
+                prepared=found.prepared,
+                chain=chain,
+                reference=reference,
+                noise_factors=noise,
+            ),
             *reference,
         )
         self.findings = ()

@@ -119,7 +119,8 @@ def test_a_worker_that_is_killed_costs_what_it_was_running(tmp_path):
                 os.kill(next(iter(pids.values())), signal.SIGKILL)
     assert all(found[i].done for i in range(12))
     started = [len(list(counts.glob(f"{label}.*"))) for label in labels]
-    assert sum(started) <= 12 + 3
+    # A worker that is killed loses what it runs, and what it has just ended if nobody has it yet.
+    assert sum(started) <= 12 + 2 * 3
 
 
 @pytest.mark.slow

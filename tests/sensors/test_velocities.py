@@ -36,6 +36,7 @@ def dvl_values(**changes):
         "current_m_s": np.zeros(2),
         "gnss_time_offset_s": np.zeros(1),
         "gnss_clock_rate_ppm": np.zeros(1),
+        "gnss_velocity_delay_s": np.zeros(1),
         **{spec.name: np.zeros(spec.size) for spec in SPECS},
     } | changes
 

@@ -5,12 +5,13 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from truth import scenario
+from truth import merged, scenario
 
 from factorgraph_dvl import solve
 from factorgraph_dvl.graph.clocks import true_time
-from factorgraph_dvl.sensors.clock import Clock
+from factorgraph_dvl.sensors.clock import Clock, LateClock
 from factorgraph_dvl.sensors.dvl import DvlVelocity
+from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.simulation import simulate
 
 # A minute with turns; two free clocks, and GNSS that is good enough to show its own.
@@ -34,6 +35,32 @@ def test_a_lag_by_hand():
     o = DvlVelocity(np.array([150.0]), np.zeros((1, 3)), np.full((1, 3), 0.01))
     dvl = {"time_offset_s": np.array([0.5]), "dvl_clock_rate_ppm": np.array([2e-4])}
     np.testing.assert_allclose(true_time(o, dvl, 100.0), [149.49])
+
+
+def test_a_velocity_is_late_beside_its_position_by_hand():
+    offset, rate, _ = specs = Gnss.specs[1:4]
+    values = {spec.name: np.array([x]) for spec, x in zip(specs, (0.5, 2e-4, -0.2), strict=True)}
+    # 0.2 s early beside the lag of 0.51 s that positions have.
+    clock = LateClock(*specs)
+    np.testing.assert_allclose(clock.lag(np.array([150.0]), values, 100.0), [0.31])
+    np.testing.assert_allclose(Clock(offset, rate).lag(np.array([150.0]), values, 100.0), [0.51])
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_late_velocity_is_found_and_named(stated):
+    """Differences of positions over a second are half a second late."""
+    claims = {"velocity_delay_s": 0.4, "velocity_delay_std_s": 0.2} if stated else {}
+    gnss = {**GNSS, "velocity_delay_s": 0.5}
+    trial = simulate(scenario(noise=True, gnss=gnss, trial=merged(FREE, {"gnss": claims})), 3)
+    solution = solve(trial, rate_hz=1.0)
+    found = solution.estimate("gnss_velocity_delay_s")
+    assert abs(found.value[0] - 0.5) < 4.0 * found.std[0] < 0.1
+    for name in ("gnss_time_offset_s", "misalignment_deg", "scale_error", "lever_arm_m"):
+        e = solution.estimate(name)
+        assert np.all(np.abs(e.value - trial.calibration_truth[name]) < 4.0 * e.std), name
+    named = [r for r in solution.verdict.reasons if r.parameter == "gnss_velocity_delay_s"]
+    assert bool(named) != stated
+    assert solution.verdict.grade == ("good" if stated else "doubtful")
 
 
 def test_offsets_and_rates_of_two_clocks_are_found():
