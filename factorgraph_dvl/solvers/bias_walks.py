@@ -96,11 +96,7 @@ def bias_walks(
         Called with stage, iteration and cost.
     """
     information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
-    imu = prepared.trial.inertial
-    walking = [bias for name, bias in _WALKS.items() if getattr(imu.settings, name) > 0.0]
-    sources = [*IMU_NOISE, *map(WALK.format, walking)]
-    squares, freedom = _squares(problem, minimum.evaluation, information, sources)
-    if not _is_not_noise(squares, freedom) and not _change(problem, minimum, information):
+    if not _walks(prepared.trial.inertial.settings, problem, minimum.evaluation, information):
         return None
     start = minimum.evaluation
     largest = _walked(prepared, problem, start, _START, noise, report)
@@ -217,10 +213,16 @@ def _squares(
     return float(squares), float(freedom)
 
 
-def _change(problem: Problem, minimum: Minimum, information: SquareRootInformation) -> bool:
-    """Whether a bias of the IMU changes along the trial."""
-    tests = component_changes(problem, minimum.evaluation, information)
-    return any(t.parameter.name in BIASES and t.change.chi2 > CHANGED**2 for t in tests)
+def _walks(
+    imu: ImuSettings, problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> bool:
+    """Whether a bias that is stated as constant changes, or the IMU does not fit its walks."""
+    changes = component_changes(problem, evaluation, information)
+    if any(c.parameter.name in BIASES and c.change.chi2 > CHANGED**2 for c in changes):
+        return True
+    walking = [WALK.format(bias) for name, bias in _WALKS.items() if getattr(imu, name) > 0.0]
+    sources = [*IMU_NOISE, *walking]
+    return bool(walking) and _is_not_noise(*_squares(problem, evaluation, information, sources))
 
 
 def _is_not_noise(squares: float, freedom: float) -> bool:

@@ -485,7 +485,7 @@ class Walks:
             or self.known.left is not None
         ):
             return
-        # Biases that are not those of an earlier calibration look as if they walked away from it.
+        # Biases that are not those of an earlier calibration look as if they walked.
         if at.model.prepared.trial.inertial.prior is not None and not _misfit(at.problem):
             return
         self._tried = True
