@@ -425,9 +425,7 @@ class Noise:
             return
         found = variance_components(problem, minimum.evaluation, minimum.information)
         before = model.noise_factors
-        factors = dict(before) | {
-            label: f.after(before[label]) for label, f in found.white.items()
-        }
+        factors = dict(before) | {label: f.after(before[label]) for label, f in found.items()}
         processes = refitted(problem, minimum.evaluation)
         for share in _SHARES:
             changed = _part_of(before, factors, share)

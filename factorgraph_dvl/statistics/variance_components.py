@@ -12,7 +12,6 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.statistics.leverage import leverage
-from factorgraph_dvl.statistics.rows import CORRELATED, rows_by_source
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviation of the logarithm of a factor before any data, as degrees of freedom at
@@ -24,8 +23,6 @@ _PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
 LEAST_FACTOR = 0.1
 # Redundancy below which no factor is estimated. Chosen: it would be uncertain by over 20 %.
 LEAST_REDUNDANCY = 10.0
-# Groups of the components of a process that is of no observation.
-_TOGETHER = ((0, 1),)
 # Relative change of a factor from which on it counts, and in its own standard deviations.
 # Chosen: less changes no σ that is shown, or is chance.
 _SAME_FACTOR = 0.05
@@ -62,22 +59,6 @@ class NoiseFactor:
         return np.where(change <= np.maximum(_SAME_FACTOR, chance), applied, self.factor)
 
 
-@dataclass(frozen=True)
-class VarianceComponents:
-    """Noise against what was assumed of it.
-
-    Parameters
-    ----------
-    white : dict of str to NoiseFactor
-        Factors of each label on the standard deviations that sensors state.
-    correlated : dict of str to NoiseFactor
-        Factors of each label on the innovations of correlated noise, relative to those assumed.
-    """
-
-    white: dict[str, NoiseFactor]
-    correlated: dict[str, NoiseFactor]
-
-
 def log_prior(noise_factors: Mapping[str, Array], observations: Iterable[Observation]) -> float:
     """Return -2 log of the prior of factors on stated noise: nu (1/f² + log f²) of each group.
 
@@ -101,8 +82,8 @@ def variance_components(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
-) -> VarianceComponents:
-    """Return factors on assumed standard deviations by restricted maximum likelihood.
+) -> dict[str, NoiseFactor]:
+    """Return factors of each label on stated deviations by restricted maximum likelihood.
 
     With residuals r whitened by the factor f that was applied, leverages h, and the share s of
     their variance that is the sensor's own,
@@ -122,48 +103,20 @@ def variance_components(
     information : SquareRootInformation
         Information there.
     """
-    processes = {CORRELATED.format(p.label): p for p in problem.processes}
-    wanted = {*problem.noise_factors, *processes}
-    source = partial(rows_by_source, problem) if processes else problem.observation_rows
+    estimated = problem.noise_factors.keys()
     count = sum(
         residual.size
         for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
-        if o.label in wanted
+        if o.label in estimated
     )
-    count += sum(p.prior_residuals(evaluation.parameters[p.name]).size for p in processes.values())
     found: dict[str, list[tuple[Array, Array]]] = {}
-    estimated = partial(filter, lambda rows: rows.source in wanted)
-    for rows, h in leverage(lambda: estimated(source(evaluation)), count, information):
+    own = partial(filter, lambda rows: rows.source in estimated)
+    for rows, h in leverage(lambda: own(problem.observation_rows(evaluation)), count, information):
         found.setdefault(rows.source, []).append((rows.vector, h))
-    white = {
+    return {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
         for label, parts in found.items()
-        if label not in processes
     }
-    groups = {o.label: o.noise_groups for o in problem.observations}
-    correlated = {
-        p.label: _innovations(found[source_name], groups.get(p.label, _TOGETHER))
-        for source_name, p in processes.items()
-        if p.label in problem.noise_factors or p.free
-    }
-    return VarianceComponents(white, correlated)
-
-
-def _innovations(
-    rows: list[tuple[Array, Array]], groups: tuple[tuple[int, ...], ...]
-) -> NoiseFactor:
-    """Return factors on the innovations of correlated noise, from residuals and leverages."""
-    # A scale that walks is the last component, and in no group.
-    size = 1 + max(map(max, groups))
-    squares = np.sum([np.sum(r[:, :size] ** 2, axis=0) for r, _ in rows], axis=0)
-    freedom = np.sum([np.sum(1.0 - h[:, :size], axis=0) for _, h in rows], axis=0)
-    factor, redundancy = np.ones(size), np.zeros(size)
-    for group in map(list, groups):
-        left = max(float(freedom[group].sum()), 0.0)
-        redundancy[group] = left
-        total = float(squares[group].sum())
-        factor[group] = np.sqrt((total + _PRIOR_FREEDOM) / (left + _PRIOR_FREEDOM))
-    return NoiseFactor(factor, redundancy)
 
 
 def _white(
