@@ -219,8 +219,16 @@ def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None
             rough=proposal.rough,
         )
         iterations += found.minimum.iterations
+        if at.rough and proposal.model is at.model:
+            return found, iterations
+        if found.objective >= at.objective:
+            continue
+        if found.minimum.converged or found.rough or not at.minimum.converged:
+            return found, iterations
         # An objective is that of a minimum: where one was not reached, it is still open.
-        if found.objective < at.objective or (at.rough and proposal.model is at.model):
+        found = estimated(found.model, found.states, found.values, report, before=found)
+        iterations += found.minimum.iterations
+        if found.minimum.converged and found.objective < at.objective:
             return found, iterations
     if not at.model.is_applied(at.problem):
         at.model.applied(at.problem)

@@ -301,6 +301,14 @@ class KnownParameters:
     first : Estimated, optional
         The minimum with noise as stated and all measurements. Where gross errors and noise that
         persists explain its misfit, a parameter may explain more, which then no longer shows.
+    freed : list of Explanation
+        Those that are estimated.
+    left : Explanation, optional
+        What still contradicts the data.
+    tested_at : float
+        Objective where they were tested last.
+    refined : bool
+        Whether one was found as noise was known better, after which none is asked for.
     """
 
     name = "a parameter that was stated"
@@ -308,11 +316,13 @@ class KnownParameters:
     freed: list[Explanation] = field(default_factory=list)
     left: Explanation | None = None
     tested_at: float = np.inf
+    refined: bool = False
     _tested: _Asked = field(default_factory=_Asked)
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the most probable of these, with noise as stated and as found."""
-        if at.minimum.converged and not self._tested.before(at.model.parameters):
+        asked = self.refined or self._tested.before(at.model.parameters)
+        if at.minimum.converged and not asked:
             yield from self.tested(at)
 
     def tested(self, at: Estimated) -> Iterator[Proposal]:
@@ -356,19 +366,27 @@ class KnownParametersAgain:
     _asked: _Asked = field(default_factory=_Asked)
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield what takes a parameter back to what was stated, then what estimates another."""
-        model = at.model
-        if not at.minimum.converged or self.known.tested_at - at.objective < _KNOWN_BETTER:
+        """Yield what takes a parameter back to what was stated, then what estimates another.
+
+        One other at most: the noise that is found may be far less than is stated, and what is
+        left beside it contradicts nothing that is stated.
+        """
+        model, known = at.model, self.known
+        if not at.minimum.converged or known.tested_at - at.objective < _KNOWN_BETTER:
             return
         if not self._asked.before(model.parameters, model.processes):
             self._asked.note(model.parameters, model.processes)
-            for cause in self.known.freed:
+            for cause in known.freed:
                 stated = cause.parameter
                 parameters = tuple(
                     stated if p.name == stated.name else p for p in model.parameters
                 )
                 yield _from(at, parameters=parameters)
-        yield from self.known.tested(at)
+        if not known.refined:
+            left, known.refined = known.left, True
+            yield from known.tested(at)
+            # None explains more.
+            known.refined, known.left = False, left
 
 
 def _applied(at: Estimated) -> Estimated:
