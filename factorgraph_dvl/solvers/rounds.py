@@ -131,7 +131,7 @@ def settle(
     findings = (
         *walks.findings,
         *averaging_findings(prepared.parameters, at),
-        *explanation_findings(known.freed, known.left, at.minimum.evaluation),
+        *explanation_findings(known.estimated_by(at.model), known.left, at.minimum.evaluation),
     )
     if going_on:
         text = message("not_converged.steps", count=len(record))

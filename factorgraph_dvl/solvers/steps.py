@@ -330,8 +330,7 @@ class KnownParameters:
         model = at.model
         self._tested.note(model.parameters)
         self.tested_at = at.objective
-        # A step may have taken a parameter back to what was stated.
-        self.freed = [c for c in self.freed if all(p is not c.parameter for p in model.parameters)]
+        self.freed = self.estimated_by(model)
         self.left = found = _explained(at)
         if len(self.freed) >= _MOST_FREED:
             return
@@ -341,6 +340,11 @@ class KnownParameters:
             yield from _freeing(cause, at)
             # It did not explain enough.
             self.freed.pop()
+
+    def estimated_by(self, model: Model) -> list[Explanation]:
+        """Return those that a model estimates: a step may have taken others back."""
+        stated = {id(p) for p in model.parameters}
+        return [cause for cause in self.freed if id(cause.parameter) not in stated]
 
     def _at_first(self, at: Estimated) -> Explanation | None:
         """Return what explains the first minimum, None where that has other parameters."""

@@ -100,7 +100,6 @@ def test_mistakes_are_named_one_after_the_other(tmp_path):
     assert {f.code for f in then} == {Code.CLOCK_OFFSET, Code.ANTENNA}
 
 
-@pytest.mark.xfail(reason="chi2 of lever arms is 31, 30.6 is chance; before, noise was wider")
 def test_lever_arms_and_clocks_of_all_dives_agree(tmp_path):
     arms, P, clocks = [], [], []
     for number in ALL:
@@ -136,9 +135,9 @@ def plain(stated, number, folder):
 
 def test_dives_settle_with_any_plain_statement(plainly):
     assert [s.converged for s in plainly] == [True] * len(ALL)
-    # An antenna seems to move by 3 cm in two of these, with the second statement.
+    # An antenna seems to move by 3 cm in one of these, with the second statement.
     usable = [s.verdict.grade == "doubtful" for s in plainly]
-    assert sum(usable) >= len(ALL) - 2
+    assert sum(usable) >= len(ALL) - 1
 
 
 def test_clocks_and_lever_arms_are_right_beside_a_propeller(plainly):
