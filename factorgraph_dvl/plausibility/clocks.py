@@ -49,7 +49,6 @@ def clock_findings(
         Length of its record, s.
     """
     mean, std = sensor.settings.velocity_lag_s
-    delay = mean - sensor.settings.time_offset_s
     if clock.gain < _LEAST_GAIN:
         return
     change = clock.rate * span
@@ -79,17 +78,17 @@ def clock_findings(
         )
     off = clock.offset - mean
     if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma):
+        stated = sensor.settings.time_offset_s
+        offset = stated + off
         yield Finding(
             Code.CLOCK_OFFSET,
             message(
-                "clock_offset.late" if clock.offset > delay else "clock_offset.early",
-                size=abs(clock.offset - delay),
+                "clock_offset.late" if offset > 0 else "clock_offset.early",
+                size=abs(offset),
                 std=max(clock.sigma, 0.005),
-                instead=""
-                if mean == delay
-                else message("clock_offset.instead", stated=mean - delay),
+                instead="" if stated == 0.0 else message("clock_offset.instead", stated=stated),
                 section=sensor.section,
-                offset=clock.offset - delay,
+                offset=offset,
             ),
             sensor.label,
             severity="error" if abs(off) > max(_COVERED * std, _HARMLESS_S) else "warning",

@@ -18,6 +18,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import DO_NOT_FIT
+from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
@@ -195,9 +196,7 @@ class Averaging:
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
-        free = {p.name: wide(p, p.mean) for p in found}
-        parameters = tuple(free.get(p.name, p) for p in model.parameters)
-        yield _from(at, parameters=parameters)
+        yield Proposal(_with_others(at, *(wide(p, p.mean) for p in found)), at.states, at.values)
 
 
 class GrossErrors:
@@ -380,12 +379,8 @@ class KnownParametersAgain:
             return
         if not self._asked.before(model.parameters, model.processes):
             self._asked.note(model.parameters, model.processes)
-            for cause in known.freed:
-                stated = cause.parameter
-                parameters = tuple(
-                    stated if p.name == stated.name else p for p in model.parameters
-                )
-                yield _from(at, parameters=parameters)
+            for cause in known.estimated_by(model):
+                yield Proposal(_with_others(at, cause.parameter), at.states, at.values)
         if not known.refined:
             left, known.refined = known.left, True
             yield from known.tested(at)
@@ -414,17 +409,20 @@ def _different(*causes: Explanation | None) -> list[Explanation]:
 
 def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     """Yield what estimates a parameter instead, with noise as stated and as found."""
-    model = at.model
-    parameters = tuple(
-        cause.freed if p.name == cause.parameter.name else p for p in model.parameters
-    )
-    tilt = model.tilt
+    freed = _with_others(at, cause.freed)
+    # What the misfit made of noise and gross errors is to be found anew.
+    for model in (freed.as_stated(), freed):
+        yield Proposal(model, at.states, at.values)
+
+
+def _with_others(at: Estimated, *others: Parameter) -> Model:
+    """Return the model with other parameters of the same names, known or to be estimated."""
+    named = {p.name: p for p in others}
+    parameters = tuple(named.get(p.name, p) for p in at.model.parameters)
+    tilt = at.model.tilt
     if tilt is not None:
         tilt = tilt.of(at.problem.parameters, tuple(p for p in parameters if p.estimated))
-    # What the misfit made of noise and gross errors is to be found anew.
-    stated = replace(model.as_stated(), parameters=parameters, tilt=tilt)
-    yield Proposal(stated, at.states, at.values)
-    yield _from(at, parameters=parameters, tilt=tilt)
+    return replace(at.model, parameters=parameters, tilt=tilt)
 
 
 class Noise:
@@ -498,7 +496,7 @@ class Walks:
     _tried: bool = False
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield walks where a sensor does not fit at all, and nothing else explains it."""
+        """Yield walks where biases change along the trial, and nothing else explains it."""
         if (
             self._tried
             or not isinstance(at.model.prepared, Preparation)

@@ -10,7 +10,7 @@ import solved
 
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import SCALE_SPEC
-from factorgraph_dvl.sensors.imu import _GYRO_BIAS
+from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers import change_along_trial
 from factorgraph_dvl.solvers.change_along_trial import ComponentChange
@@ -77,7 +77,7 @@ def test_a_change_below_the_limit_of_its_parameter_is_a_drift(monkeypatch, size,
 @pytest.mark.parametrize(("shift", "grade"), [(-9e-4, "doubtful"), (1.1e-3, "do not use")])
 def test_a_change_beside_the_calibration_counts_as_it_moves_it(monkeypatch, shift, grade):
     scale = Parameter(SCALE_SPEC, np.zeros(1), np.ones(1))
-    bias = Parameter(_GYRO_BIAS, np.zeros(3), np.ones(3))
+    bias = Parameter(Imu.specs[0], np.zeros(3), np.ones(3))
     beside = Change(9.0, 9.0, 50.0, 0.1, 1e-4, np.zeros(2))
     change = Change(40.0, 40.0, 50.0, 0.5, 0.1, np.array([shift, 0.5]))
     tests = [ComponentChange(p.name, p, c) for p, c in ((scale, beside), (bias, change))]
