@@ -497,14 +497,14 @@ class Walks:
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield walks where biases change along the trial, and nothing else explains it."""
-        if (
-            self._tried
-            or not isinstance(at.model.prepared, Preparation)
-            or self.known.left is not None
-        ):
+        prepared = at.model.prepared
+        if self._tried or not isinstance(prepared, Preparation) or self.known.left is not None:
+            return
+        imu = prepared.trial.inertial
+        if not prepared.trial.estimates_noise(imu):
             return
         # Biases that are not those of an earlier calibration look as if they walked.
-        if at.model.prepared.trial.inertial.prior is not None and not _misfit(at.problem):
+        if imu.prior is not None and not _misfit(at.problem):
             return
         self._tried = True
         # A walk explains what is beyond the noise that is stated.
