@@ -18,7 +18,7 @@ import numpy as np
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.vectors import Array, IntArray, median
 from factorgraph_dvl.imu.arc_polynomials import UNIFORM, ArcPolynomials, open_steps
-from factorgraph_dvl.imu.interpolation import Smoothed, Smoothing, smooth, unsmoothed
+from factorgraph_dvl.imu.interpolation import Smoothed, smooth, unsmoothed
 from factorgraph_dvl.imu.polynomials import evaluate, integrate, rate_and_slope
 from factorgraph_dvl.imu.timestamps import JUMP, fill_lost, unrounded
 from factorgraph_dvl.message import message
@@ -94,13 +94,13 @@ class Increments(ArcPolynomials):
         open: lost ones, or a step between two of them; else 0.
     accel_sigma : float
         Standard deviation of one sample of the force from its noise, m/s².
-    smoothing : tuple of (Smoothing, Smoothing), optional
+    smoothing : tuple of (int, int), optional
         How rate and force are smoothed; None = chosen from the record.
     """
 
     open_sigma: Array
     accel_sigma: float
-    smoothing: tuple[Smoothing, Smoothing] | None = None
+    smoothing: tuple[int, int] | None = None
 
     @cached_property
     def fastest(self) -> float:
@@ -188,9 +188,7 @@ class Increments(ArcPolynomials):
                 omega[mine], alpha[mine] = self._blended_rate(index[mine], since[mine])
             else:
                 omega[mine], alpha[mine], misfit = rate.at(time[mine])
-                # If a measurement follows vibration, its residuals show that.
-                between = 0.0 if rate.by.vibration else unresolved[mine]
-                unresolved[mine] = np.hypot(between, misfit)
+                unresolved[mine] = np.hypot(unresolved[mine], misfit)
         return {
             "omega": omega,
             "alpha": alpha,
@@ -209,10 +207,10 @@ class Increments(ArcPolynomials):
             yield slice(None) if alone else np.flatnonzero(self.arc_of[index] == arc), signals
 
     @property
-    def chosen_smoothing(self) -> tuple[Smoothing, Smoothing]:
+    def chosen_smoothing(self) -> tuple[int, int]:
         """How rate and force of the last arc are smoothed."""
         rate, force = self.smoothed[-1]
-        return rate.by, force.by
+        return rate.window, force.window
 
     def release(self) -> None:
         """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
@@ -254,14 +252,14 @@ class Increments(ArcPolynomials):
             return unsmoothed(dt, self.gyro_sigma), unsmoothed(dt, self.accel_sigma)
         by_rate, by_force = (None, None) if self.smoothing is None else self.smoothing
         return (
-            smooth(time, rate, dt, self.gyro_sigma, averaged=self.averaged, by=by_rate),
+            smooth(time, rate, dt, self.gyro_sigma, averaged=self.averaged, window=by_rate),
             smooth(
                 time,
                 force,
                 dt,
                 self.accel_sigma,
                 averaged=self.averaged,
-                by=by_force,
+                window=by_force,
                 with_misfit=False,
             ),
         )
@@ -293,7 +291,7 @@ class Increments(ArcPolynomials):
 
 
 def increments(
-    imu: Imu, smoothing: tuple[Smoothing, Smoothing] | None = None
+    imu: Imu, smoothing: tuple[int, int] | None = None
 ) -> tuple[Increments, tuple[Finding, ...]]:
     """Return increments between the samples of an IMU, and what had to be bridged.
 
@@ -301,7 +299,7 @@ def increments(
     ----------
     imu : Imu
         Record of the IMU.
-    smoothing : tuple of (Smoothing, Smoothing), optional
+    smoothing : tuple of (int, int), optional
         See `Increments`.
 
     Returns
@@ -352,7 +350,7 @@ def unbroken_increments(
     time: Array,
     rate: Array,
     force: Array,
-    smoothing: tuple[Smoothing, Smoothing],
+    smoothing: tuple[int, int],
     wanted: slice,
 ) -> Increments:
     """Return increments between samples of which none was lost, with times as they are.
@@ -367,7 +365,7 @@ def unbroken_increments(
         Times of the samples, `_LEAST` at least.
     rate, force : ndarray, shape (S, 3)
         The samples.
-    smoothing : tuple of (Smoothing, Smoothing)
+    smoothing : tuple of (int, int)
         See `Increments`.
     wanted : slice
         The samples between which increments are wanted, `_LEAST` at least.
@@ -399,7 +397,7 @@ def unbroken_increments(
 def _increments(
     settings: ImuSettings,
     step: float,
-    smoothing: tuple[Smoothing, Smoothing] | None,
+    smoothing: tuple[int, int] | None,
     **arrays: Array,
 ) -> Increments:
     """Return increments of these arrays, and of the noise of samples every `step` s."""

@@ -12,11 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import factorial
-from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BSpline, make_interp_spline
-from scipy.ndimage import correlate1d
 
 from factorgraph_dvl.geometry.local_cubics import SHORT, filter_matrix, filtered, polynomial
 from factorgraph_dvl.geometry.vectors import Array
@@ -34,18 +32,6 @@ _NARROW = 2 * _HALF_WIDTHS[0] + 1
 # too long.
 _REPEATED = 30.0
 _BLOCK = 500
-# Frequency, Hz, above which motion is vibration, half-width of the filter that takes it off, s,
-# and widths that a record must have to show what goes on. Chosen: a ping or a Doppler measurement
-# takes about a tenth of a second, and whether it follows what is faster is not known; no hull
-# sways at 8 Hz. Measured: a propeller of 24 Hz, 1.8 m from the IMU, gave the clock of an INS a
-# minimum every 42 ms.
-_VIBRATION = 8.0
-_FILTER = 0.5
-_GOES_ON = 10
-# Share of a motion below which what passes the filter is no vibration. Chosen: it leaks less.
-_LEAK = 1e-3
-# Standard deviations of its power by which vibration exceeds noise. Chosen: chance never does.
-_SURE = 5.0
 # Samples that the window is chosen from. Chosen: minutes of motion, searched in milliseconds.
 _ENOUGH = 60_000
 # Noise of a derivative between single samples, in units of sample noise over interval.
@@ -56,21 +42,6 @@ _AT_ONCE = 50_000
 _BESIDE = 50
 # Differences between a narrow and the chosen window beyond which the motion has a step.
 _STEP = 4.0
-
-
-class Smoothing(NamedTuple):
-    """How a signal is smoothed.
-
-    Parameters
-    ----------
-    window : int
-        Number of samples that each value is made of, 0 where they are left alone.
-    vibration : float, default 0
-        Mean square of the vibration in the samples.
-    """
-
-    window: int
-    vibration: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -85,15 +56,15 @@ class Smoothed:
         What the window does not resolve, over time; None where nothing, or where not asked for.
     sigma, slope_sigma : float
         Standard deviation of value and derivative from the noise.
-    by : Smoothing
-        How it is smoothed.
+    window : int
+        Number of samples that each value is made of, 0 where they are left alone.
     """
 
     spline: BSpline | None
     misfit: BSpline | None
     sigma: float
     slope_sigma: float
-    by: Smoothing
+    window: int
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return value, derivative and what is not resolved at times, (M, 3) each."""
@@ -112,63 +83,31 @@ class Smoothed:
 
 def unsmoothed(dt: float, sigma: float) -> Smoothed:
     """Return a signal that is not smoothed, with its noise."""
-    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, Smoothing(0))
+    return Smoothed(None, None, sigma, _RAW_SLOPE * sigma / dt, 0)
 
 
-def best_smoothing(values: Array, dt: float, sigma: float) -> Smoothing:
-    """Return the window with the least error of noise and motion together, and the vibration.
+def best_window(values: Array, dt: float, sigma: float) -> int:
+    """Return the window with the least error of noise and motion together, 0 for none.
 
     What a window takes of a sway that goes on is alike in many measurements, and counts as often.
-    So does vibration that it leaves: no measurement is known to follow it.
     """
     few = values[:_ENOUGH]
-    vibration, power = _vibration(few, dt, sigma)
-    motion = few if vibration is None else few - vibration
-    best, width = sigma**2 + _REPEATED * power, 0
+    best, width = sigma**2, 0
     for half in _HALF_WIDTHS:
         window = 2 * half + 1
         if half * dt > _LONGEST or window >= few.shape[0]:
             break
         weights = polynomial(window)[0]
         kept = float(weights @ weights)
-        moved = np.mean((filtered(motion, window) - motion) ** 2, axis=1)
+        moved = np.mean((filtered(few, window) - few) ** 2, axis=1)
         by_noise = sigma**2 * (1.0 - 2.0 * weights[half] + kept)
         by_motion = max(float(np.mean(moved)) - by_noise, 0.0)
         chance = 1.25 * by_noise * np.sqrt(2.0 * window / few.size)
         by_sway = max(float(np.median(_means(moved, _BLOCK))) - by_noise - chance, 0.0)
-        left = 0.0 if vibration is None else _power(filtered(vibration, window), dt)
-        goes_on = (_REPEATED - 1.0) * by_sway + _REPEATED * left
-        error = by_motion + goes_on + sigma**2 * kept
+        error = by_motion + (_REPEATED - 1.0) * by_sway + sigma**2 * kept
         if error < best:
             best, width = error, window
-    return Smoothing(width, power)
-
-
-def _vibration(values: Array, dt: float, sigma: float) -> tuple[Array | None, float]:
-    """Return what is faster than motion and goes on, (N, 3), and its mean square.
-
-    None and 0 where that is only noise.
-    """
-    half = round(_FILTER / dt)
-    if 4.0 * _VIBRATION * dt > 1.0 or _GOES_ON * 2 * half > values.shape[0]:
-        return None, 0.0
-    taps = np.sinc(2.0 * _VIBRATION * dt * np.arange(-half, half + 1)) * np.blackman(2 * half + 1)
-    passed = -taps / taps.sum()
-    passed[half] += 1.0
-    fast = np.asarray(correlate1d(values, passed, axis=0, mode="nearest"))
-    by_noise = sigma**2 * float(passed @ passed)
-    chance = 1.25 * by_noise * np.sqrt(2.0 / values.size)
-    least = by_noise + _SURE * chance + _LEAK**2 * float(np.mean(values**2))
-    power = _power(fast, dt)
-    return (fast, power) if power > least else (None, 0.0)
-
-
-def _power(fast: Array, dt: float) -> float:
-    """Return the mean square of a vibration, the median of that of short times.
-
-    A step is fast only for a short time.
-    """
-    return float(np.median(_means(np.mean(fast**2, axis=1), round(2.0 * _FILTER / dt))))
+    return width
 
 
 def _means(values: Array, size: int) -> Array:
@@ -185,7 +124,7 @@ def smooth(
     sigma: float,
     *,
     averaged: bool,
-    by: Smoothing | None = None,
+    window: int | None = None,
     with_misfit: bool = True,
 ) -> Smoothed:
     """Smooth a signal.
@@ -202,17 +141,15 @@ def smooth(
         Standard deviation of a sample.
     averaged : bool
         Whether samples are means over their intervals.
-    by : Smoothing, optional
-        How; None = `best_smoothing`.
+    window : int, optional
+        Samples of which each value is made; None = `best_window`.
     with_misfit : bool, default True
         Whether to find what the window does not resolve.
     """
-    by = best_smoothing(values, dt, sigma) if by is None else by
-    width = by.window
+    width = best_window(values, dt, sigma) if window is None else window
     if width == 0 or width > values.shape[0]:
         return unsmoothed(dt, sigma)
-    # Vibration is no step: if a measurement follows it, its residuals show that.
-    least = _STEP * float(np.hypot(sigma * white_gain(_NARROW), np.sqrt(by.vibration)))
+    least = _STEP * sigma * white_gain(_NARROW)
     misfit: Array | None
     if values.shape[0] > SHORT:
         spline, misfit = _long_spline(time, values, width, least, averaged=averaged)
@@ -228,7 +165,7 @@ def smooth(
         misfit=line,
         sigma=sigma * white_gain(width),
         slope_sigma=sigma * slope_gain(width) / dt,
-        by=by,
+        window=width,
     )
 
 

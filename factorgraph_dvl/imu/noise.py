@@ -10,10 +10,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from factorgraph_dvl.geometry.units import DEG_PER_SQRT_HOUR, MICRO_G
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.sensors.imu import Imu
+from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
 # Chosen: samples to a spectrum, and the window, whose side lobes are 180 dB down: sway of
 # 1 rad/s leaks less than the quietest gyro's noise into the bands.
@@ -40,6 +40,11 @@ _LOST = 1.5
 # Chosen: noise that is larger than stated by less than this leaves every σ as good as it was.
 # Of the scenarios' records of 15,000 samples or more it is 0.98 to 1.02 of the stated one.
 _LARGER = 1.1
+# Keys of the settings, with their units, of gyros and accelerometers.
+_KEYS = {
+    "gyro_noise_deg_sqrt_h": (DEG_PER_SQRT_HOUR, "deg/√h"),
+    "accel_noise_ug_sqrt_hz": (MICRO_G, "µg/√Hz"),
+}
 
 
 class WhiteNoise(NamedTuple):
@@ -63,22 +68,44 @@ def white_noise(imu: Imu, *, stretches: int | None = None) -> WhiteNoise | None:
     stretches : int, optional
         About how many of its stretches are looked at; all by default.
     """
-    step = np.diff(imu.time)
-    dt = float(np.median(step)) if step.size else np.inf
-    breaks = np.concatenate([[0], np.flatnonzero(step > _LOST * dt) + 1, [imu.time.size]])
-    longest = int(np.argmax(np.diff(breaks)))
-    part = slice(breaks[longest], breaks[longest + 1])
-    inner = step[breaks[longest] : breaks[longest + 1] - 1]
-    if inner.size < _LEAST_SAMPLES:
+    parts, dt, regular = unbroken_parts(imu.time)
+    longest = int(np.argmax(np.diff(parts)))
+    part = slice(parts[longest], parts[longest + 1])
+    inner = part.stop - part.start - 1
+    if inner < _LEAST_SAMPLES or not regular:
         return None
-    if np.quantile(np.abs(inner / dt - 1.0), 0.99) > _REGULAR:
-        return None
-    every = 1 if stretches is None else max(inner.size // _APART // stretches, 1)
+    every = 1 if stretches is None else max(inner // _APART // stretches, 1)
     return WhiteNoise(_lowest(imu.gyro[part], dt, every), _lowest(imu.accel[part], dt, every))
 
 
-def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
-    """Return an IMU whose stated noise is at least that of its record, and what was found.
+def unbroken_parts(time: Array) -> tuple[IntArray, float, bool]:
+    """Return where parts of a record without gaps begin and end, and how samples follow.
+
+    Parameters
+    ----------
+    time : ndarray, shape (N,), s
+        Times of the samples.
+
+    Returns
+    -------
+    edges : ndarray of int, shape (P + 1,)
+        First sample of each part, and the number of samples.
+    interval : float, s
+        Usual interval of the samples, infinite where there is only one.
+    regular : bool
+        Whether samples of the longest part follow at that interval.
+    """
+    step = np.diff(time)
+    dt = float(np.median(step)) if step.size else np.inf
+    edges = np.concatenate([[0], np.flatnonzero(step > _LOST * dt) + 1, [time.size]])
+    longest = int(np.argmax(np.diff(edges)))
+    inner = step[edges[longest] : edges[longest + 1] - 1]
+    unlike = np.quantile(np.abs(inner / dt - 1.0), 0.99) if inner.size else np.inf
+    return edges, dt, bool(unlike <= _REGULAR)
+
+
+def with_recorded_noise(imu: Imu) -> Imu:
+    """Return an IMU whose noise is at least that of its record.
 
     Parameters
     ----------
@@ -88,37 +115,29 @@ def with_recorded_noise(imu: Imu) -> tuple[Imu, tuple[Finding, ...]]:
     stated = (imu.settings.gyro_noise_root_psd, imu.settings.accel_noise_root_psd)
     found = white_noise(imu, stretches=_FIRST_LOOK)
     if found is None or all(f < _CLEARLY_LESS * s for f, s in zip(found, stated, strict=True)):
-        return imu, ()
+        return imu
     found = white_noise(imu)
     assert found is not None
-    changes: dict[str, float] = {}
-    findings: list[Finding] = []
-    for text, value, claimed, (si, unit, key) in (
-        (
-            "imu_noise.gyros",
-            found.gyro,
-            stated[0],
-            (DEG_PER_SQRT_HOUR, "deg/√h", "gyro_noise_deg_sqrt_h"),
-        ),
-        (
-            "imu_noise.accelerometers",
-            found.accel,
-            stated[1],
-            (MICRO_G, "µg/√Hz", "accel_noise_ug_sqrt_hz"),
-        ),
-    ):
-        if value > _LARGER * claimed:
-            changes[key] = value / si
-            findings.append(
-                Finding(
-                    Code.IMU_NOISE,
-                    message(text, ratio=value / claimed, value=value / si, unit=unit, name=key),
-                    sensor="IMU",
-                )
-            )
+    changes = {
+        key: value / si
+        for (key, (si, _)), value, claimed in zip(_KEYS.items(), found, stated, strict=True)
+        if value > _LARGER * claimed
+    }
     if not changes:
-        return imu, ()
-    return replace(imu, settings=msgspec.structs.replace(imu.settings, **changes)), tuple(findings)
+        return imu
+    return replace(imu, settings=msgspec.structs.replace(imu.settings, **changes))
+
+
+def noise_findings(stated: ImuSettings, used: ImuSettings) -> tuple[Finding, ...]:
+    """Return what the user must know where the noise of an IMU is larger than stated."""
+    findings = []
+    for key, (_, unit) in _KEYS.items():
+        value, claimed = getattr(used, key), getattr(stated, key)
+        if value > _LARGER * claimed:
+            text = "imu_noise.gyros" if key.startswith("gyro") else "imu_noise.accelerometers"
+            said = message(text, ratio=value / claimed, value=value, unit=unit, name=key)
+            findings.append(Finding(Code.IMU_NOISE, said, sensor="IMU"))
+    return tuple(findings)
 
 
 def _lowest(samples: Array, dt: float, every: int) -> float:

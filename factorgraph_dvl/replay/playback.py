@@ -10,6 +10,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import ConfigError, SolveError
 from factorgraph_dvl.imu.timestamps import without_restarted_clock
+from factorgraph_dvl.imu.vibration import without_vibration
 from factorgraph_dvl.message import message
 from factorgraph_dvl.plausibility.earlier_calibration import prior_findings
 from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
@@ -132,7 +133,7 @@ def replay(
     errors = accepted_errors(survey(trial), anyway=anyway)
     with explained(errors):
         solution, record = _played(
-            trial if trial.imu is None else without_restarted_clock(trial),
+            trial if trial.imu is None else _as_prepared(trial),
             smoother=smoother,
             lag_s=lag_s,
             rate_hz=rate_hz,
@@ -140,6 +141,12 @@ def replay(
             watch=watch,
         )
     return solution.with_findings(errors), record
+
+
+def _as_prepared(trial: Trial) -> Trial:
+    """Return a trial with the samples of its IMU as `solve` takes them."""
+    trial = without_restarted_clock(trial)
+    return replace(trial, imu=without_vibration(trial.inertial))
 
 
 def _played(

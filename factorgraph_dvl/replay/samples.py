@@ -9,7 +9,6 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.imu.increments import MAX_FILLED, increments, unbroken_increments
-from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.imu.preintegration import Segments, one_segment
 from factorgraph_dvl.imu.timestamps import unrounded
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings, within_limits
@@ -61,7 +60,7 @@ class SampleBuffer:
     ----------
     dt : float
         Sample interval, s; 0 until it is known.
-    smoothing : tuple of (Smoothing, Smoothing)
+    smoothing : tuple of (int, int)
         How gyros and accelerometers are smoothed.
     longest : float
         Length of the longest window over which a sensor averages, s.
@@ -76,7 +75,7 @@ class SampleBuffer:
         self._time, self._number = np.empty((2, 0))
         self._stale: list[Array] = []
         self.dt = 0.0
-        self.smoothing = Smoothing(0), Smoothing(0)
+        self.smoothing = 0, 0
         self.longest = 0.0
         self.rejected = 0
         self.interpolated = 0
@@ -89,7 +88,7 @@ class SampleBuffer:
     @property
     def side(self) -> int:
         """Samples needed after a segment before it can be integrated."""
-        return self._near + max(by.window for by in self.smoothing) // 2
+        return self._near + max(self.smoothing) // 2
 
     @property
     def _near(self) -> int:

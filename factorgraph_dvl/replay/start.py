@@ -18,7 +18,6 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.correlated_errors import CorrelatedErrors
@@ -67,7 +66,7 @@ class ReplayStart:
         Whether there are ranges to beacons.
     own_states : tuple of str
         Sections of the sensors whose every measurement needs a state of its own.
-    smoothing : tuple of (Smoothing, Smoothing)
+    smoothing : tuple of (int, int)
         How gyros and accelerometers are smoothed.
     longest : float
         Length of the longest window over which a sensor averages, s.
@@ -104,7 +103,7 @@ class ReplayStart:
     sections: tuple[str, ...]
     ranges: bool
     own_states: tuple[str, ...]
-    smoothing: tuple[Smoothing, Smoothing]
+    smoothing: tuple[int, int]
     longest: float
     spurious: Array
     noise_factors: Mapping[str, Array]

@@ -21,11 +21,13 @@ from factorgraph_dvl.imu.noise import with_recorded_noise
 from factorgraph_dvl.imu.preintegration import Segments, segments
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.timestamps import without_restarted_clock
+from factorgraph_dvl.imu.vibration import without_vibration
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
 from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.sensors.clock import on_shared_clocks
+from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation, observed
 from factorgraph_dvl.solution import Progress
@@ -124,6 +126,8 @@ class Preparation:
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
         Mountings of attitude sensors found by the gyros, by parameter name.
+    stated_imu : ImuSettings
+        Settings of the IMU as the trial states them.
     findings : tuple of Finding
         What the user must know.
     """
@@ -136,6 +140,7 @@ class Preparation:
     estimated_noise: frozenset[str]
     start_positions: StartPositions
     mountings: dict[str, Array]
+    stated_imu: ImuSettings
     findings: tuple[Finding, ...]
 
     @property
@@ -200,10 +205,10 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     """
     # What the result is compared with has no part in it.
     trial = replace(without_restarted_clock(trial), reference=None, calibration_truth={})
-    noise_findings: tuple[Finding, ...] = ()
-    if trial.estimates_noise(trial.inertial):
-        imu, noise_findings = with_recorded_noise(trial.inertial)
-        trial = replace(trial, imu=imu)
+    imu = trial.inertial
+    if trial.estimates_noise(imu):
+        imu = with_recorded_noise(imu)
+    stated, trial = trial.inertial.settings, replace(trial, imu=without_vibration(imu))
     frame = trial.frame()
     report("increments", 0, None)
     inc, gaps = increments(trial.inertial)
@@ -233,9 +238,9 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         ),
         start_positions=start_positions,
         mountings=start.mountings,
+        stated_imu=stated,
         findings=(
             *trial.notes,
-            *noise_findings,
             *gaps,
             *start.findings,
             *star_catalogue_findings(trial.aids),

@@ -16,6 +16,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.imu.noise import noise_findings
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.solution import Progress, SolverStep
@@ -24,7 +25,7 @@ from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_othe
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised, with_all_digits
-from factorgraph_dvl.solvers.preparation import Prepared
+from factorgraph_dvl.solvers.preparation import Preparation, Prepared
 from factorgraph_dvl.solvers.steps import (
     Averaging,
     Correlation,
@@ -129,6 +130,7 @@ def settle(
             if going_on:
                 break
     findings = (
+        *_imu_findings(at),
         *walks.findings,
         *averaging_findings(prepared.parameters, at),
         *explanation_findings(known.estimated_by(at.model), known.left, at.minimum.evaluation),
@@ -140,6 +142,14 @@ def settle(
     at.problem.release()
     minimum = replace(minimum, converged=minimum.converged and not going_on, iterations=iterations)
     return SettledMinimum(at.problem, minimum, not going_on, findings, tuple(record))
+
+
+def _imu_findings(at: Estimated) -> tuple[Finding, ...]:
+    """Return what the user must know about the noise of the IMU that a model ends with."""
+    prepared = at.model.prepared
+    if not isinstance(prepared, Preparation):
+        return ()
+    return noise_findings(prepared.stated_imu, prepared.trial.inertial.settings)
 
 
 def _start(

@@ -26,7 +26,6 @@ from factorgraph_dvl.graph.sensor_factor import (
 )
 from factorgraph_dvl.imu.gtsam_measurements import preintegrate
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.imu.preintegration import one_segment
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
@@ -76,7 +75,7 @@ def node_measurements(time=20.0, **changes):
         gyro=trial.imu.gyro[window],
         accel=trial.imu.accel[window],
     )
-    inc, _ = increments(imu, (Smoothing(0), Smoothing(0)))
+    inc, _ = increments(imu, (0, 0))
     first = int(np.argmin(np.abs(inc.start - time)))
     last = int(np.argmin(np.abs(inc.end - time - 1.0))) + 1
     seg = one_segment(inc, first, last)
@@ -213,7 +212,7 @@ def test_a_stationary_vessel_reports_the_velocity_of_its_lever_arm():
     gyro = np.tile([0.0, 0.0, 0.1], (time.size, 1))
     trial = simulate(scenario())
     imu = replace(trial.imu, time=time, gyro=gyro, accel=np.tile([0, 0, 9.8], (time.size, 1)))
-    inc, _ = increments(imu, (Smoothing(0), Smoothing(0)))
+    inc, _ = increments(imu, (0, 0))
     chain = chain_of(imu, frame, one_segment(inc, 50, 100), np.array([[0.0, 0.0, -9.8]]))
     estimated = [p for p in dvl.parameters() if p.estimated]
     fixed = {p.name: p.mean for p in dvl.parameters() if not p.estimated}

@@ -12,7 +12,6 @@ from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
 from factorgraph_dvl.geometry.units import DEG, HOUR
 from factorgraph_dvl.geometry.vectors import rotate
 from factorgraph_dvl.imu.increments import increments, unbroken_increments
-from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 
@@ -174,7 +173,7 @@ def test_what_was_smoothed_and_freed_is_the_same():
 @pytest.mark.parametrize("sampling", ["mean", "instantaneous"])
 def test_a_part_is_smoothed_with_what_is_beside_it(sampling):
     imu = record(np.arange(101) / 100.0, sampling)
-    samples = imu.settings, imu.time, imu.gyro, imu.accel, (Smoothing(11), Smoothing(25))
+    samples = imu.settings, imu.time, imu.gyro, imu.accel, (11, 25)
     whole, part = (unbroken_increments(*samples, rows) for rows in (slice(None), slice(40, 70)))
     time = np.random.default_rng(1).uniform(imu.time[48], imu.time[61], 20)
     expected, found = (inc.partial(*inc.locate(time)[:2]) for inc in (whole, part))

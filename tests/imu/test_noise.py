@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from truth import CONING, merged, scenario
 
-from factorgraph_dvl.imu.noise import white_noise, with_recorded_noise
+from factorgraph_dvl.imu.noise import noise_findings, white_noise, with_recorded_noise
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.imu import Imu
 from factorgraph_dvl.sensors.protocol import NoiseModel
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.preparation import prepare
+from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.trial import Trial
 
 # Turns without ramps step the rate; 4 deg of sway at 2 Hz is 1 rad/s.
@@ -54,19 +54,19 @@ def ratios(imu: Imu) -> tuple[float, float]:
 
 def test_stated_noise_is_found_as_stated_under_sway() -> None:
     assert ratios(swaying().imu) == pytest.approx((1.0, 1.0), abs=0.03)
-    unchanged, findings = with_recorded_noise(swaying().imu)
-    assert unchanged is swaying().imu
-    assert findings == ()
+    assert with_recorded_noise(swaying().imu) is swaying().imu
 
 
 def test_more_noise_is_found_and_used() -> None:
     imu = with_noise(swaying().imu, 3.0)
     assert ratios(imu) == pytest.approx((3.0, 3.0), rel=0.05)
-    changed, findings = with_recorded_noise(imu)
+    changed = with_recorded_noise(imu)
     assert changed.settings.gyro_noise_root_psd == pytest.approx(
         3.0 * imu.settings.gyro_noise_root_psd, rel=0.05
     )
+    findings = noise_findings(imu.settings, changed.settings)
     assert [finding.code for finding in findings] == [Code.IMU_NOISE] * 2
+    assert noise_findings(changed.settings, imu.settings) == ()
     assert "times the stated noise of the" in str(findings[0])
 
 
@@ -77,7 +77,7 @@ def test_quieter_noise_changes_nothing() -> None:
         "accel_noise_ug_sqrt_hz": 5 * imu.settings.accel_noise_ug_sqrt_hz,
     }
     imu = replace(imu, settings=msgspec.structs.replace(imu.settings, **stated))
-    assert with_recorded_noise(imu) == (imu, ())
+    assert with_recorded_noise(imu) is imu
 
 
 def test_vibration_and_jerks_are_no_noise() -> None:
@@ -97,7 +97,7 @@ def test_records_that_do_not_tell(jitter: float) -> None:
     time = imu.time[:count] + jitter * np.random.default_rng(2).uniform(-1, 1, count)
     part = replace(imu, time=time, gyro=imu.gyro[:count], accel=imu.accel[:count])
     assert white_noise(part) is None
-    assert with_recorded_noise(part) == (part, ())
+    assert with_recorded_noise(part) is part
 
 
 def test_the_solver_uses_it_unless_noise_is_as_stated() -> None:
@@ -105,15 +105,15 @@ def test_the_solver_uses_it_unless_noise_is_as_stated() -> None:
     trial = simulate(scenario(**quiet), seed=3)
     trial = replace(trial, imu=with_noise(trial.imu, 3.0))
 
-    def prepared(noise: NoiseModel) -> tuple[float, set[str]]:
-        given = prepare(replace(trial, noise=noise), 1.0, lambda *_: None)
-        found = {str(finding.code) for finding in given.findings}
-        return given.trial.imu.settings.gyro_noise_root_psd, found
+    def ended_with(noise: NoiseModel) -> tuple[float, set[str]]:
+        solved, *_ = solved_problems(replace(trial, noise=noise))
+        found = {str(finding.code) for finding in solved.findings}
+        return solved.problem.chain.imu.gyro_noise_root_psd, found
 
     stated = trial.imu.settings.gyro_noise_root_psd
-    used, found = prepared("estimated")
-    assert used == pytest.approx(3.0 * stated, rel=0.1)
+    used, found = ended_with("estimated")
+    assert used == pytest.approx(3.0 * stated, rel=0.15)
     assert "imu_noise" in found
-    used, found = prepared("stated")
+    used, found = ended_with("stated")
     assert used == stated
     assert "imu_noise" not in found

@@ -59,29 +59,9 @@ def test_the_cost_has_no_jump_in_value_or_slope(noisy, clock, place):
     assert abs(after - before) < 1e-6 * size
 
 
-@pytest.fixture(scope="module")
-def shaken():
-    """Return the same beside a propeller; antenna and DVL do not follow what shakes the IMU."""
-    scene = scenario(
-        manoeuvres=[{"straight_s": 15}, *SHORT],
-        noise=True,
-        trial=CLOCKS,
-        imu={"sampling": "instantaneous"},
-        sway={"pitch": [{"amplitude_deg": 0.002, "frequency_hz": 24.0}]},
-    )
-    problem, values = problem_of(scene)
-    assert problem.chain.segments.increments.chosen_smoothing[0].vibration > 0.0
-    return problem, problem.weighed(problem.evaluate(values))
-
-
 @pytest.mark.parametrize("clock", ["time_offset_s", "gnss_time_offset_s"])
 def test_derivatives_by_a_clock_are_those_of_residuals(noisy, clock):
     assert_derivatives(*noisy, clock)
-
-
-@pytest.mark.parametrize("clock", ["time_offset_s", "gnss_time_offset_s"])
-def test_derivatives_by_a_clock_are_those_of_residuals_beside_a_propeller(shaken, clock):
-    assert_derivatives(*shaken, clock)
 
 
 def assert_derivatives(problem, evaluation, clock):

@@ -7,7 +7,6 @@ import pytest
 from truth import scenario
 
 from factorgraph_dvl.imu.increments import increments
-from factorgraph_dvl.imu.interpolation import Smoothing
 from factorgraph_dvl.imu.preintegration import one_segment, segments
 from factorgraph_dvl.imu.propagation import attach
 from factorgraph_dvl.replay.samples import SampleBuffer
@@ -82,22 +81,6 @@ def test_every_segment_ends_after_its_start(rate, interval, decimals):
         assert now == pytest.approx(time[-1], abs=1e-3)
         if not wanted:
             assert states <= (now - begin) / interval + 2.0
-
-
-def test_vibration_is_no_step_in_a_segment_either():
-    """A rate that is off by what the whole record shows to go on is not uncertain for that."""
-    time = np.arange(1, 1200) / 100.0
-    rows = table(time)
-    rows[:, 1:4] += 0.02 * np.sin(2.0 * np.pi * 24.0 * time)[:, None]
-    samples = SampleBuffer(NOISE)
-    samples.add(rows)
-    found = []
-    for vibration in (0.0, 0.5 * 0.02**2):
-        samples.smoothing = Smoothing(15, vibration), Smoothing(0)
-        seg = samples.segment_after(5.0, 1.0, np.inf, end=False)
-        at = attach(seg, np.linspace(5.1, 5.9, 9), np.zeros(3))
-        found.append(np.max(at.omega_sigma))
-    assert found[1] < 0.1 * found[0]
 
 
 def test_one_segment_is_that_of_the_whole_chain():

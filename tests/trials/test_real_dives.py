@@ -135,20 +135,21 @@ def plain(stated, number, folder):
 
 def test_dives_settle_with_any_plain_statement(plainly):
     assert [s.converged for s in plainly] == [True] * len(ALL)
-    # An antenna seems to move by 3 cm in one of these, with the second statement.
-    usable = [s.verdict.grade == "doubtful" for s in plainly]
-    assert sum(usable) >= len(ALL) - 1
+    # Accelerometers are late beside gyros, and noise is far below what is stated.
+    assert [s.verdict.grade for s in plainly] == ["doubtful"] * len(ALL)
+    # What vibrates is no noise.
+    assert not any(f.code == Code.IMU_NOISE for s in plainly for f in s.findings)
 
 
 def test_clocks_and_lever_arms_are_right_beside_a_propeller(plainly):
-    """Clocks had a minimum every 0.042 s; the INS does not follow its vibration."""
+    """Clocks had a minimum every 0.042 s, or every 0.016 s: the INS follows no vibration."""
     for number, solution in zip(ALL, plainly, strict=True):
         clock = solution.estimate("gnss_time_offset_s").value[0]
-        # Velocities of the INS are late beside its attitudes, most in dive 4.
-        assert abs(clock - BY_ATTITUDE[number]) < 0.022, number
+        # Velocities of the INS are as late beside its attitudes in all of them.
+        assert abs(clock - BY_ATTITUDE[number] - 0.010) < 0.008, number
         arm = solution.estimate("lever_arm_m").value - solution.estimate("gnss_lever_arm_m").value
-        # Dives agree on it to 0.012 m.
-        assert abs(arm[0] + 1.838) < 0.04, number
+        # Dives agree on it to 0.010 m.
+        assert abs(arm[0] + 1.857) < 0.025, number
 
 
 def test_dives_agree_on_the_scale(plainly):
