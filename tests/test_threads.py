@@ -51,6 +51,7 @@ def check_first_use(trial, runs):
     assert set(found) == {output_of("first-use", "alone", trial)}
 
 
+@pytest.mark.slow
 def test_types_may_be_used_first_in_several_threads(trials):
     check_first_use(trials / "imu", 8)
 

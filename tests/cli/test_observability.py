@@ -202,6 +202,7 @@ def test_the_shipped_trial(tmp_path: Path, run: Run) -> None:
     assert run("observability", SHIPPED, "--out", out)[0] == 2
 
 
+@pytest.mark.slow
 def test_a_solution_alone(tmp_path: Path, run: Run) -> None:
     folder, out = tmp_path / "solution", tmp_path / "out"
     assert run("solve", SHIPPED, "--out", folder, "--no-figures", "--quiet")[0] == 0

@@ -39,6 +39,7 @@ def test_output_that_cannot_be_written_is_said_and_exits_1(tmp_path: Path) -> No
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("as_json", [(), ("--json",)])
 @pytest.mark.parametrize("command", ["--version", "--help", "inspect", "report", "export"])
 def test_every_command_says_that_its_output_cannot_be_written(
@@ -152,6 +153,7 @@ def test_names_give_a_terminal_no_orders(tmp_path: Path, run: Run) -> None:
     assert not set("\x1b\x9b\u202e") & set(shown.out + shown.err + refused.out + refused.err)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 @pytest.mark.parametrize(
     ("locale", "name"),

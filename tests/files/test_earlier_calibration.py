@@ -221,6 +221,7 @@ def test_files_there_and_back(tmp_path):
     np.testing.assert_allclose(copy.imu.bias_covariance(), trial.imu.bias_covariance())
 
 
+@pytest.mark.slow
 def test_a_replay_knows_of_biases_what_the_batch_does(two):
     _, second, a = two
     trial = both_from(second, as_calibration(a))

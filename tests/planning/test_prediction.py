@@ -24,6 +24,7 @@ CORRELATED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes", [{}, WALKING, CORRELATED], ids=["constant", "walking", "correlated"]
 )

@@ -256,6 +256,7 @@ def test_a_scale_that_walks_is_reported_as_it_is_at_the_end():
     assert scale.std[0] > 1.2 * mean.std[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_noise_that_is_stated_wrong_is_estimated(factor):
     """Both solvers find how large the noise is, from which the replay goes on."""

@@ -202,6 +202,7 @@ def test_gnss_and_bottom_lock_may_fail(trial):
         assert noticed == [Code.SILENT, Code.HEARD_AGAIN]
 
 
+@pytest.mark.slow
 def test_a_gap_of_the_imu_is_survived_and_a_silent_sensor_after_it(trial):
     short = replace(
         trial,

@@ -119,6 +119,7 @@ def test_what_comes_later_changes_nothing(ship, played):
     np.testing.assert_allclose(early.values[:same], whole.values[:same], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out(ship, played):
     velocity = ship.dvl.velocity.copy()
     # After the last batch solution.
@@ -135,6 +136,7 @@ def test_a_lag_is_all_that_there_is(ship):
         replay(ship, smoother="isam2")
 
 
+@pytest.mark.slow
 def test_gaps_of_pings_are_bridged_and_said(ship):
     kept = (ship.dvl.time < 95.0) | (ship.dvl.time > 120.0)
     solution, record = replay(replace(ship, dvl=rows_of(ship.dvl, kept)), rate_hz=0.2)

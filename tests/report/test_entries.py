@@ -48,6 +48,7 @@ def printed(run: Run, trial: Path, out: Path) -> dict[str, tuple[float, float]]:
     return {name: (float(value), float(std)) for name, value, std in ROW.findall(result.out)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mounting", "arm"),
     [

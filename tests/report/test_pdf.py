@@ -60,6 +60,7 @@ def texts(page: sheet.Sheet) -> list[str]:
     return [t.get_text() for t in page.figure.texts]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reasons", [0, 1, 12])
 def test_it_has_three_pages_of_a4_and_nothing_is_cut(tmp_path, sheets, reasons):
     file = tmp_path / "report.pdf"

@@ -106,6 +106,7 @@ def printed(solution, maker: str) -> dict[str, float]:
     return {plain(row[0]): float(plain(row[1]).partition(" ±")[0]) for row in rows}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("maker", "axes", "recorded", "mount", "configured"),
     [
@@ -145,6 +146,7 @@ def test_a_dvl_configured_as_printed_has_no_misalignment_and_no_lever_arm(
         assert np.abs(again.estimate(name).value).max() < after, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("maker", "axes", "prefix"),
     [("Teledyne RDI Pathfinder", "RFU", "TRDI "), ("Water Linked A50", "FRD", "Water Linked ")],

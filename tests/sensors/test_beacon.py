@@ -207,6 +207,7 @@ def dive(**changes):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_trial_without_a_position_is_solved_and_echoes_are_named(tmp_path):
     trial = simulate(dive(), seed=2)
     solution = solve(trial, rate_hz=1.0)

@@ -104,6 +104,7 @@ def test_noiseless_dive_is_exact():
     assert_exact(trial, solution, limit=0.1, trajectory=0.6)
 
 
+@pytest.mark.slow
 def test_scale_and_surface_of_a_slow_pressure_sensor_are_as_good_as_they_say():
     """With fixes at the surface, and 30 m down: density off by 2 %, an offset over minutes."""
     down = [{"climb_m_s": -0.5, "to_height_m": -30}, {"straight_s": 60}]

@@ -89,6 +89,7 @@ READ = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pipe", "device", "socket", "loop"])
 @pytest.mark.parametrize(
     ("line", "file"), [(line, file) for line, files in READ for file in files]

@@ -54,6 +54,7 @@ def sigma_of(solution, name):
     return float(np.sqrt(solution.covariance[i][i]))
 
 
+@pytest.mark.slow
 def test_a_stated_window_costs_no_precision_and_a_window_of_none_is_left_alone():
     trial = trial_of(0.5, 1, averaging_s=0.5)
     stated = solve(trial)
@@ -66,6 +67,7 @@ def test_a_stated_window_costs_no_precision_and_a_window_of_none_is_left_alone()
         assert sigma_of(stated, name) < 1.1 * sigma_of(certain, name)
 
 
+@pytest.mark.slow
 def test_a_window_that_is_not_stated_is_found():
     trial = trial_of(0.5, 2)
     found = solve(trial)
@@ -101,6 +103,7 @@ def test_a_stamp_at_the_end_is_half_a_window_late():
     assert found.verdict.grade == "good"
 
 
+@pytest.mark.slow
 def test_single_beams_average_too():
     plan = plan_in_swell()
     del plan["dvl"], plan["trial"]["dvl"]

@@ -44,6 +44,7 @@ def errors(solution, trial):
     )
 
 
+@pytest.mark.slow
 def test_a_walk_that_was_not_stated_is_estimated(honest):
     walk = 6000.0
     trial = faults.with_faults(honest, [faults.imu_bias_walk(0.0, walk)], 1)
@@ -65,6 +66,7 @@ def test_a_walk_that_was_not_stated_is_estimated(honest):
     assert 0.6 < float(row.assumed.split()[0]) / walk < 1.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [

@@ -46,6 +46,7 @@ def test_a_velocity_is_late_beside_its_position_by_hand():
     np.testing.assert_allclose(Clock(offset, rate).lag(np.array([150.0]), values, 100.0), [0.51])
 
 
+@pytest.mark.slow
 def test_a_late_velocity_is_estimated_where_that_is_stated():
     """Differences of positions over a second are half a second late."""
     claims = {"velocity_delay_s": 0.4, "velocity_delay_std_s": 0.2}
@@ -60,6 +61,7 @@ def test_a_late_velocity_is_estimated_where_that_is_stated():
     assert solution.verdict.grade == "good"
 
 
+@pytest.mark.slow
 def test_offsets_and_rates_of_two_clocks_are_found():
     trial = simulate(scenario(noise=True, gnss=GNSS, trial=FREE), 3)
     middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
@@ -86,6 +88,7 @@ def test_offsets_and_rates_of_two_clocks_are_found():
         assert np.all(np.abs(error) < 4.5 * solution.estimate(name).std), name
 
 
+@pytest.mark.slow
 def test_a_stated_offset_of_gnss_is_taken_away():
     scene = scenario(gnss=GNSS, trial={"gnss": {"time_offset_std_s": 0}})
     trial = simulate(scene)

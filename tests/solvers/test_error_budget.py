@@ -55,6 +55,7 @@ def test_causes_add_up_to_the_reported_variances(solution):
     assert by_name["accelerometer noise"].assumed == "25 µg/√Hz"
 
 
+@pytest.mark.slow
 def test_directions_that_are_fixed_have_their_share():
     scene = scenario(noise=True, manoeuvres=[{"straight_s": 30}], sway={}, imu={"rate_hz": 50})
     solution = solve(simulate(scene, 0), rate_hz=1.0)

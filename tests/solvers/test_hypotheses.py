@@ -11,6 +11,7 @@ from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.solvers.batch import solve
 
 
+@pytest.mark.slow
 def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
     t = trial(1, **STRAIGHT)
     solution = solve(t, rate_hz=1.0)

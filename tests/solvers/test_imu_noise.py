@@ -48,6 +48,7 @@ def test_noise_that_is_stated_too_large_is_found(trial):
     assert "noise of the IMU" in [step.change for step in solved.steps]
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_those_of_the_right_noise(trial):
     one, other = (solve(each, rate_hz=1.0) for each in (trial, stated(trial, 10.0)))
     sigma = [np.sqrt(np.diag(each.covariance)) for each in (one, other)]

@@ -77,6 +77,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_cause_is_named_and_estimated(trial, name):
     fault, size = FAULTS[name]

@@ -44,6 +44,7 @@ def test_echoes_are_named_and_lost_ranges_do_no_harm():
     assert rms[1] < max(1.3 * rms[0], 3.0)
 
 
+@pytest.mark.slow
 def test_a_depth_that_is_noisier_than_the_ranges_counts_as_it_does():
     deep = {"positions": {"B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -400}}}
     t = trial(0, depth={"rate_hz": 1, "std_m": 3.0}, beacons={**deep, "range_std_m": 0.3})

@@ -16,6 +16,7 @@ from factorgraph_dvl.solvers.batch import solve
 SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
 
 
+@pytest.mark.slow
 def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
     t = trial(**STRAIGHT)
     b = t.beacons

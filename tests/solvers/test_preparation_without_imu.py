@@ -171,6 +171,7 @@ def test_the_axis_that_points_ahead(axes, expected):
     assert (name, pytest.approx(angle)) == expected
 
 
+@pytest.mark.slow
 def test_a_mount_that_is_turned_far_is_said_by_a_bearing():
     scenario = shortened()
     dvl = msgspec.structs.replace(scenario.dvl, misalignment_deg=[0.0, 0.0, -60.0])
@@ -261,6 +262,7 @@ def test_gtsams_own_optimiser_and_marginals_agree(short):
     assert_same(solution, problem, evaluation.values, found, marginals.marginalCovariance)
 
 
+@pytest.mark.slow
 def test_isam2_agrees(short):
     solution, solved = short
     problem, evaluation = solved.problem, solved.minimum.evaluation
@@ -358,6 +360,7 @@ def test_white_noise_of_an_ins_moves_no_clock():
     assert abs(offset.value[0]) < 4.0 * offset.std[0]
 
 
+@pytest.mark.slow
 def test_the_current_is_its_mean_over_the_trial():
     trial = simulate(shortened("ship-water"), 2)
     solution, solved = solve_with_problem(trial, rate_hz=0.1)

@@ -35,6 +35,7 @@ def test_a_short_trial_starts_by_itself(prepared):
     assert started_from_stretch(prepared, silent) is prepared
 
 
+@pytest.mark.slow
 def test_a_stretch_leads_to_the_same_answer(prepared, short):
     started = started_from_stretch(prepared, silent)
     assert np.all(started.first_chain.density != prepared.first_chain.density, axis=1).any()

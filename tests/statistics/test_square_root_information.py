@@ -11,6 +11,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walk", [1.0, 1e5])
 def test_marginals_are_those_of_the_whole_matrix_however_far_biases_walk(walk):
     imu = {"gyro_bias_walk_deg_h_sqrt_h": walk, "accel_bias_walk_ug_sqrt_h": 0.0}

@@ -45,6 +45,7 @@ def test_noise_as_stated_stays_as_stated(trial, honest):
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [5.0, 0.2])
 @pytest.mark.parametrize("sensor", ["dvl", "gnss"])
 def test_stated_noise_wrong_by_five_is_recovered(trial, honest, sensor, wrong):

@@ -62,6 +62,7 @@ def test_a_usbl_in_place_of_gnss(without_imu, measures):
     assert solution.estimate("misalignment_deg").std[2] < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without_imu", [False, True])
 def test_transponders_are_found_between_fixes_at_the_surface(without_imu):
     gnss = {"rate_hz": 2, "position_std_m": [0.1, 0.1, 0.2], "outages_s": [[60, 120]]}

@@ -56,6 +56,7 @@ def test_a_wrong_rotation_is_seen(solved):
     assert np.abs(bad.after).max() > 10.0 * np.abs(good.after).max()
 
 
+@pytest.mark.slow
 def test_the_first_half_is_tested_on_the_second():
     trial = simulate(config("seed-a-phase-90"), 2)
     solution = solve(trial)

@@ -83,6 +83,7 @@ def test_at_rest_in_the_water_a_current_shows_no_mounting():
     assert int(view.point_set.segments[0].observed.sum()) == 3
 
 
+@pytest.mark.slow
 def test_a_current_that_was_not_estimated_is_named():
     trial = straight(35.0, **WATER)
     solution = solve(trial)
@@ -108,6 +109,7 @@ def test_an_estimated_bias_takes_the_scale_from_a_straight_run():
     assert view.marginals.ratio[at] > 0.9
 
 
+@pytest.mark.slow
 def test_a_time_offset_is_named_as_taken_for_known():
     trial = straight(35.0, trial={"dvl": {"time_offset_std_s": 0.1}})
     view = observability(solve(trial), trial=trial)
@@ -117,6 +119,7 @@ def test_a_time_offset_is_named_as_taken_for_known():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [5.0, 20.0])
 def test_noise_of_rates_is_no_lever_arm(rate_hz):
     solution = solve(straight(120.0, **MEMS), rate_hz=rate_hz)

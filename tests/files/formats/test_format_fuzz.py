@@ -31,6 +31,7 @@ def test_damaged_input(name, count):
     assert found["useful"] > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIBRARIES)
 def test_damaged_input_of_a_library(name):
     form = EXTRAS[name]

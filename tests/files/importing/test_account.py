@@ -338,6 +338,7 @@ class TestRecordings:
         # The rest of the file is zeros.
         assert found["damaged"] == (0, len(lines) - typed + cut + 1)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("name", "lacks"),
         [
