@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -101,13 +102,19 @@ def component_changes(
 
 
 def change_findings(
-    found: SolvedProblem, every: Iterable[Rows], limits: Mapping[str, float]
+    found: SolvedProblem,
+    every: Iterable[Rows],
+    estimates: Iterable[Estimate],
+    limits: Mapping[str, float],
 ) -> Iterator[Finding]:
     """Yield a finding where a parameter changes along the trial by more than chance allows.
 
     Of several components the most probable one is named, and those that are about as probable.
     A change below what is good enough is a drift that the standard deviation lacks, and no reason
     not to use the mean. Nor is a change of something else that moves what is calibrated by less.
+    A clock that is known to 0.5 s may be linearised 0.5 s off, and seem to change by that. So what
+    changes by less than its standard deviation is left out. Measurements depend on biases of the
+    IMU in the same way everywhere.
 
     Parameters
     ----------
@@ -115,13 +122,21 @@ def change_findings(
         Problem at its minimum, with covariances.
     every : iterable of Rows
         All rows of the graph that is linearised there.
+    estimates : iterable of Estimate
+        What is reported of each parameter.
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     """
     tests = component_changes(
         found.problem, found.minimum.evaluation, found.covariances.information, every
     )
-    significant = [t for t in tests if t.change.chi2 >= CHANGED**2]
+    std = {n: s for e in estimates for n, s in zip(e.component_names, e.std, strict=True)}
+    significant = [
+        t
+        for t in tests
+        if t.change.chi2 >= CHANGED**2
+        and (t.parameter.name in BIASES or std[t.name] < abs(t.change.size))
+    ]
     if not significant:
         return
     largest = max(t.change.fall for t in significant)

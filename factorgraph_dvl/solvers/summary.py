@@ -72,7 +72,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     changes: list[Finding] = []
     # The rows, which take longest to make, serve both.
     error_budget = causes(
-        found, lambda rows: changes.extend(change_findings(found, rows, trial.limits))
+        found, lambda rows: changes.extend(change_findings(found, rows, estimates, trial.limits))
     )
     findings += changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)

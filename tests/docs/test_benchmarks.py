@@ -101,15 +101,7 @@ def test_a_changed_tree_is_named(benchmark, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=pytest.mark.xfail(reason="the page is to be made again"))
-        if n == "beams"
-        else n
-        for n in SAMPLED
-    ],
-)
+@pytest.mark.parametrize("name", SAMPLED)
 def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark):
     module = benchmark(name)
     page = (ROOT / "docs" / module.PAGE).read_text(encoding="utf-8")
