@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum, auto
 
 import gtsam
 import numpy as np
@@ -151,128 +152,223 @@ def minimise(
             where=stage,
             hint="Inspect the trial: a unit or a column may be wrong",
         )
-    gaussian = problem.linearize(evaluation)
-    ordering, sizes = problem.ordering(), values.dims()
     if enough:
         enough *= 0.5 * sum(np.count_nonzero(weights) for weights in problem.weights)
-    root: SquareRootInformation | None = None
-    damping = 0.0
-    # Greatest damping with which a step failed since the cost last fell.
-    failed = -1.0
-    careful = held = settled = False
-    promised = before = np.inf
-    # Where the last steps began, and what these were by the linear model there.
-    past: list[tuple[gtsam.Values, gtsam.VectorValues]] = []
-    iteration = 0
+    search = _Search(
+        problem=problem,
+        evaluation=evaluation,
+        gaussian=problem.linearize(evaluation),
+        ordering=problem.ordering(),
+        sizes=values.dims(),
+        tolerance=tolerance,
+        proven=proven,
+        enough=enough,
+    )
     if progress:
         progress(stage, 0, evaluation.cost)
-    while iteration < max_iterations:
-        iteration += 1
-        damped = _damped(gaussian, evaluation.values, damping) if damping > 0.0 else gaussian
-        if held:
-            damped = _held(damped, problem.clock_keys)
-        last = proven and damping == 0.0 and promised < _NEAR
-        delta = None if careful or last else quick_step(damped, ordering)
-        promised = (
-            _promised(problem, evaluation, gaussian, delta) if delta is not None else -np.inf
-        )
-        if delta is None or (proven and not promised > max(tolerance, _NEARLY)):
-            root = eliminated(damped, problem.ordering(branches=False), sizes)
-            delta = root.solution()
-            promised = _promised(problem, evaluation, gaussian, delta)
-        assert delta is not None
-        past = [*past[-_MEMORY:], (evaluation.values, delta)] if damping == 0.0 else []
-        if promised > max(tolerance, _NEARLY):
-            changed = past if promised > _POOR_GAIN * before else past[-1:]
+    end = None
+    while end is None and search.iteration < max_iterations:
+        end = search.advance()
+        if progress:
+            progress(stage, search.iteration, search.evaluation.cost)
+    return search.minimum(end)
+
+
+class _End(Enum):
+    """Why a minimisation ends: at a minimum, low enough, with clocks held, or without a step."""
+
+    MINIMUM = auto()
+    ENOUGH = auto()
+    HELD = auto()
+    STUCK = auto()
+
+
+@dataclass
+class _Search:
+    """A minimisation on its way.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is minimised.
+    evaluation : Evaluation
+        The lowest so far.
+    gaussian : gtsam.GaussianFactorGraph
+        The linear model there.
+    ordering : gtsam.Ordering
+        Ordering of the quick elimination.
+    sizes : dict of int to int
+        Dimensions of the variables.
+    tolerance, proven, enough : float or bool
+        As of `minimise`; `enough` as a cost.
+    iteration : int
+        Accepted and refused steps.
+    damping : float
+        That of the next step.
+    failed : float
+        Greatest damping with which a step failed since the cost last fell.
+    careful : bool
+        Whether steps are from QR, because one may have been bad for want of digits.
+    held : bool
+        Whether clocks stay where they are.
+    promised, before : float
+        What the linear model says that the last step and the one before take off the cost.
+    root : SquareRootInformation or None
+        From QR at the last step, if it was.
+    past : list of tuple of gtsam.Values and gtsam.VectorValues
+        Where the last steps began, and what these were by the linear model there.
+    """
+
+    problem: Problem
+    evaluation: Evaluation
+    gaussian: gtsam.GaussianFactorGraph
+    ordering: gtsam.Ordering
+    sizes: dict[int, int]
+    tolerance: float
+    proven: bool
+    enough: float
+    iteration: int = 0
+    damping: float = 0.0
+    failed: float = -1.0
+    careful: bool = False
+    held: bool = False
+    promised: float = np.inf
+    before: float = np.inf
+    root: SquareRootInformation | None = None
+    past: list[tuple[gtsam.Values, gtsam.VectorValues]] = field(default_factory=list)
+
+    def advance(self) -> _End | None:
+        """Try a step; return why it was the last one, None if it was not."""
+        self.iteration += 1
+        self.root = None
+        delta = self._step()
+        trial = self._trial(delta)
+        if trial is None:
+            return None
+        lower = trial.cost <= self.evaluation.cost * (1.0 + _ROUNDING)
+        if np.isfinite(trial.cost) and (lower or self.promised < self.tolerance):
+            return self._accepted(trial, lower=lower)
+        return self._refused(delta)
+
+    def minimum(self, end: _End | None) -> Minimum:
+        """Return where it ended."""
+        if end is _End.MINIMUM:
+            return Minimum(self.evaluation, self.root, True, self.iteration)
+        if end is _End.ENOUGH:
+            return Minimum(self.evaluation, None, False, self.iteration)
+        delta = self._from_qr(self.gaussian)
+        settled = end is _End.HELD or self._is_within(delta)
+        return Minimum(self.evaluation, self.root, settled, self.iteration)
+
+    def _step(self) -> gtsam.VectorValues:
+        """Return the step of the linear model, damped and with clocks held as it is to be."""
+        graph = self.gaussian
+        if self.damping > 0.0:
+            graph = _damped(graph, self.evaluation.values, self.damping)
+        if self.held:
+            graph = _held(graph, self.problem.clock_keys)
+        last = self.proven and self.damping == 0.0 and self.promised < _NEAR
+        delta = None if self.careful or last else quick_step(graph, self.ordering)
+        if delta is not None:
+            self.promised = self._promise(delta)
+        if delta is None or (self.proven and not self._is_large):
+            delta = self._from_qr(graph)
+        self.past = [*self.past[-_MEMORY:], (self.evaluation.values, delta)]
+        if self.damping > 0.0:
+            self.past = []
+        return delta
+
+    def _from_qr(self, graph: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
+        """Return the step from QR, and keep the information."""
+        self.root = eliminated(graph, self.problem.ordering(branches=False), self.sizes)
+        delta = self.root.solution()
+        self.promised = self._promise(delta)
+        return delta
+
+    def _promise(self, delta: gtsam.VectorValues) -> float:
+        """Return by how much the linear model says that the cost falls."""
+        beside = 0.0 if self.problem.tilt is None else self.problem.tilt.constant
+        return float(self.evaluation.cost + beside - self.gaussian.error(delta))
+
+    @property
+    def _is_large(self) -> bool:
+        """Whether a step promises so much that it is not the last one."""
+        return self.promised > max(self.tolerance, _NEARLY)
+
+    def _trial(self, delta: gtsam.VectorValues) -> Evaluation | None:
+        """Return where a step leads to; None if clocks are to be held instead."""
+        problem, evaluation, promised = self.problem, self.evaluation, self.promised
+        if self._is_large:
+            changed = self.past if promised > _POOR_GAIN * self.before else self.past[-1:]
             trial = _tried(problem, evaluation, delta, promised, changed)
         else:
             trial = problem.evaluate(evaluation.values.retract(delta))
-        before = promised
+        self.before = promised
         fallen = evaluation.cost - trial.cost
-        if promised > _WITHIN and fallen < _POOR_GAIN * promised and damping == 0.0:
-            if not held and fallen < _HARDLY * promised and _at_jump(problem, evaluation, delta):
-                held, past, root = True, [], None
-                continue
-            bent = _bent(problem, evaluation, delta, ordering)
+        if promised > _WITHIN and fallen < _POOR_GAIN * promised and self.damping == 0.0:
+            little = not self.held and fallen < _HARDLY * promised
+            if little and _at_jump(problem, evaluation, delta):
+                self.held, self.past = True, []
+                return None
+            bent = _bent(problem, evaluation, delta, self.ordering)
             trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
-            gaussian = problem.linearize(evaluation)
-        lower = trial.cost <= evaluation.cost * (1.0 + _ROUNDING)
-        small = promised < tolerance
-        if np.isfinite(trial.cost) and (lower or small):
-            decrease = evaluation.cost - trial.cost
-            gain = decrease / promised if promised > 0.0 else 1.0
-            # A model that was right about this step promises no more after it.
-            right = abs(promised - decrease) < tolerance
-            ended = small or (right and (promised < _NEARLY or not proven))
-            if trial.cost < evaluation.cost * (1.0 - _ROUNDING):
-                failed = -1.0
-            if lower:
-                evaluation = trial
-            if progress:
-                progress(stage, iteration, evaluation.cost)
-            if ended and damping == 0.0 and held:
-                settled, gaussian = True, problem.linearize(evaluation)
-                break
-            if ended and damping == 0.0 and (root is not None or not proven):
-                return Minimum(evaluation, root, True, iteration)
-            if evaluation.cost < enough:
-                return Minimum(evaluation, None, False, iteration)
-            if small or gain > _GOOD_GAIN:
-                damping = damping / 10.0 if damping > _FIRST_DAMPING else 0.0
-            elif gain < _POOR_GAIN:
-                damping *= 10.0
-            gaussian = problem.linearize(evaluation)
-            if damping <= failed:
-                # Steps that small gain nothing, and larger ones fail: so it would go on.
-                break
-        elif promised < _WITHIN and damping == 0.0 and held:
-            settled = True
-            break
-        elif (
-            damping == 0.0
-            and (root is not None or not proven)
-            and _within(problem, promised, root, delta)
-        ):
-            return Minimum(evaluation, root, True, iteration)
-        elif not careful and root is None:
+            self.gaussian = problem.linearize(evaluation)
+        return trial
+
+    def _accepted(self, trial: Evaluation, *, lower: bool) -> _End | None:
+        """Take a step that lowers the cost, or promises nothing, and say if it is the last one."""
+        promised, decrease = self.promised, self.evaluation.cost - trial.cost
+        small = promised < self.tolerance
+        gain = decrease / promised if promised > 0.0 else 1.0
+        # A model that was right about this step promises no more after it.
+        right = abs(promised - decrease) < self.tolerance
+        ended = small or (right and (promised < _NEARLY or not self.proven))
+        if trial.cost < self.evaluation.cost * (1.0 - _ROUNDING):
+            self.failed = -1.0
+        if lower:
+            self.evaluation = trial
+        if ended and self.damping == 0.0 and self._is_proven and not self.held:
+            return _End.MINIMUM
+        held = ended and self.damping == 0.0 and self.held
+        if not held and self.evaluation.cost < self.enough:
+            return _End.ENOUGH
+        self.gaussian = self.problem.linearize(self.evaluation)
+        if held:
+            return _End.HELD
+        if small or gain > _GOOD_GAIN:
+            self.damping = self.damping / 10.0 if self.damping > _FIRST_DAMPING else 0.0
+        elif gain < _POOR_GAIN:
+            self.damping *= 10.0
+        # Steps that small gain nothing, and larger ones fail: so it would go on.
+        return _End.STUCK if self.damping <= self.failed else None
+
+    def _refused(self, delta: gtsam.VectorValues) -> _End | None:
+        """Damp the next step, or say that none lowers the cost."""
+        if self.damping == 0.0 and self.held and self.promised < _WITHIN:
+            return _End.HELD
+        if self.damping == 0.0 and self._is_proven and self._is_within(delta):
+            return _End.MINIMUM
+        if not self.careful and self.root is None:
             # The step may have been bad for want of digits only.
-            careful = True
-        else:
-            failed = damping
-            damping = max(damping * 10.0, _FIRST_DAMPING)
-            if damping > _MAX_DAMPING:
-                break
-        root = None
-    root = eliminated(gaussian, problem.ordering(branches=False), sizes)
-    delta = root.solution()
-    promised = _promised(problem, evaluation, gaussian, delta)
-    settled = settled or _within(problem, promised, root, delta)
-    return Minimum(evaluation, root, settled, iteration)
+            self.careful = True
+            return None
+        self.failed = self.damping
+        self.damping = max(self.damping * 10.0, _FIRST_DAMPING)
+        return _End.STUCK if self.damping > _MAX_DAMPING else None
 
+    @property
+    def _is_proven(self) -> bool:
+        """Whether the last step is as certain as it has to be."""
+        return self.root is not None or not self.proven
 
-def _within(
-    problem: Problem,
-    promised: float,
-    root: SquareRootInformation | None,
-    delta: gtsam.VectorValues,
-) -> bool:
-    """Whether a step promises hardly anything, and would move no constant that is reported."""
-    if root is None or promised < _WITHIN or promised > _LITTLE or not problem.parameters:
-        return promised < _WITHIN
-    step = np.concatenate([delta.at(problem.key(name)) for name in problem.columns])
-    variance = np.diag(root.covariance_of([every_constant(problem)]))
-    return bool(np.all(np.abs(step) < _SAME * np.sqrt(variance)))
-
-
-def _promised(
-    problem: Problem,
-    evaluation: Evaluation,
-    gaussian: gtsam.GaussianFactorGraph,
-    delta: gtsam.VectorValues,
-) -> float:
-    """Return by how much the linear model says that the cost falls."""
-    beside = 0.0 if problem.tilt is None else problem.tilt.constant
-    return float(evaluation.cost + beside - gaussian.error(delta))
+    def _is_within(self, delta: gtsam.VectorValues) -> bool:
+        """Whether a step promises hardly anything, and would move no constant that is reported."""
+        problem, root, promised = self.problem, self.root, self.promised
+        if root is None or promised < _WITHIN or promised > _LITTLE or not problem.parameters:
+            return promised < _WITHIN
+        step = np.concatenate([delta.at(problem.key(name)) for name in problem.columns])
+        variance = np.diag(root.covariance_of([every_constant(problem)]))
+        return bool(np.all(np.abs(step) < _SAME * np.sqrt(variance)))
 
 
 def _tried(
