@@ -406,3 +406,23 @@ def _turned(jacobian: Array | None, axes: Array) -> Array | None:
 
 
 _OF_STATE = ("nRb", "p_n", "v_n", "omega_b")
+
+
+def far_apart(first: float, own: Array, longest: float) -> Array:
+    """Return a time, s, and those after it that are half the longest step apart, or more."""
+    kept = [first]
+    for t in own.tolist():
+        if t - kept[-1] > 0.5 * longest:
+            kept.append(t)
+    return np.array(kept)
+
+
+def without_long_steps(edges: Array, longest: float) -> Array:
+    """Return times (M,), s, with others in between where steps are too long."""
+    wide = np.flatnonzero(np.diff(edges) > longest)
+    more = [
+        np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
+        for i in wide
+    ]
+    every = np.unique(np.concatenate([edges, *more]))
+    return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])

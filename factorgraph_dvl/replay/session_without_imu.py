@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.smooth_chain import SmoothChain
+from factorgraph_dvl.graph.smooth_chain import SmoothChain, far_apart, without_long_steps
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.message import message
@@ -39,10 +39,8 @@ from factorgraph_dvl.solvers.preparation_without_imu import (
     LONGEST,
     TURN_SPAN,
     WAVES,
-    far_apart,
     prepare_without_imu,
     track_axes,
-    without_long_steps,
 )
 from factorgraph_dvl.solvers.rounds import settle
 from factorgraph_dvl.solvers.true_times import nodes_late

@@ -26,7 +26,8 @@ from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.correlated_noise import noise_of
-from factorgraph_dvl.solvers.posterior import posterior
+from factorgraph_dvl.solvers.posterior import Posterior, posterior
+from factorgraph_dvl.solvers.rounds import SettledMinimum
 from factorgraph_dvl.solvers.state_times import needs_states
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.trial import Trial
@@ -189,7 +190,19 @@ def solve_start(
     unsure = _not_linear(trial, covariances.nodes[-1])
     if unsure is not None:
         return unsure
-    evaluation = minimum.evaluation
+    return _condensed(trial, settled, covariances, interval, since, clock_zero)
+
+
+def _condensed(
+    trial: Trial,
+    settled: SettledMinimum,
+    covariances: Posterior,
+    interval: float,
+    since: float,
+    clock_zero: float,
+) -> ReplayStart:
+    """Return what a minimum says of its last state and of the constants; see `solve_start`."""
+    problem, evaluation = settled.problem, settled.minimum.evaluation
     # The whole error, also what all states share: the smoother linearises later states without it.
     spurious = spurious_information(problem, evaluation, covariances.nodes).sum(axis=0)
     chain = problem.chain

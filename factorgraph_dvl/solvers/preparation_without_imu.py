@@ -17,7 +17,12 @@ from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import Tilt, prior_mean
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
-from factorgraph_dvl.graph.smooth_chain import ChainStates, SmoothChain
+from factorgraph_dvl.graph.smooth_chain import (
+    ChainStates,
+    SmoothChain,
+    far_apart,
+    without_long_steps,
+)
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
@@ -514,26 +519,6 @@ def _nodes(
     before = kept[0] - step * np.arange((kept[0] - first) // step + 1.0, 0.0, -1.0)
     after = kept[-1] + step * np.arange(1.0, (last - kept[-1]) // step + 3.0)
     return without_long_steps(np.concatenate([before, kept, after]), longest)
-
-
-def far_apart(first: float, own: Array, longest: float) -> Array:
-    """Return a time, s, and those after it that are half the longest step apart, or more."""
-    kept = [first]
-    for t in own.tolist():
-        if t - kept[-1] > 0.5 * longest:
-            kept.append(t)
-    return np.array(kept)
-
-
-def without_long_steps(edges: Array, longest: float) -> Array:
-    """Return times (M,), s, with others in between where steps are too long."""
-    wide = np.flatnonzero(np.diff(edges) > longest)
-    more = [
-        np.linspace(edges[i], edges[i + 1], int(np.ceil((edges[i + 1] - edges[i]) / longest)) + 1)
-        for i in wide
-    ]
-    every = np.unique(np.concatenate([edges, *more]))
-    return np.asarray(every[np.concatenate([[True], np.diff(every) > 1e-3])])
 
 
 def phases(record: AttitudeRecord, time: Array) -> IntArray:
