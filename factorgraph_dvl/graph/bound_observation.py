@@ -22,7 +22,13 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.window_means import by_motion_in_the_middle
 from factorgraph_dvl.sensors.imu import ERRORS
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion, Observation, ObservationByRows
+from factorgraph_dvl.sensors.protocol import (
+    Linearization,
+    Motion,
+    Observation,
+    ObservationByRows,
+    Window,
+)
 
 # Unit of the residuals of attitudes.
 _ANGLE = "rad"
@@ -164,12 +170,12 @@ class BoundObservation:
         """Whether it measures attitude alone, and attitudes of the chain are by themselves."""
         return self.chain.attitude_clock is not None and self.observation.unit == _ANGLE
 
-    def window(self, parameters: Mapping[str, Array]) -> float | None:
-        """Return the length of the window that measurements are means over, s; None = of none."""
+    def window(self, parameters: Mapping[str, Array]) -> Window | None:
+        """Return the window that measurements are means over; None = of none."""
         name = self.observation.averaging
         if name is None or not (self.averages or parameters[name].any()):
             return None
-        return float(parameters[name][0])
+        return Window(float(parameters[name][0]), self.observation.averages_in_body)
 
     def attach(self, parameters: Mapping[str, Array]) -> None:
         """Attach measurements to the chain by clocks as they are."""

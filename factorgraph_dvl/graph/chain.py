@@ -15,7 +15,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
 
 @dataclass(frozen=True)
@@ -176,7 +176,7 @@ class Chain(Protocol):
         self,
         time: Array,
         shift: float = 0.0,
-        window: float | None = None,
+        window: Window | None = None,
         *,
         of_attitude: bool = False,
     ) -> Any:
@@ -188,8 +188,8 @@ class Chain(Protocol):
             Times by the clock of the nodes.
         shift : float, default 0, s
             Shift of the clock of attitudes beside it.
-        window : float, optional, s
-            Length of windows about the times, of measurements that are means. A chain without
+        window : Window, optional
+            Windows about the times, of measurements that are means. A chain without
             samples leaves it out.
         of_attitude : bool, default False
             Whether they are measurements of attitude alone: the track counts for nothing.

@@ -50,7 +50,7 @@ from factorgraph_dvl.imu.two_way import (
 )
 from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 from factorgraph_dvl.trial import Trial
 
 GYRO_NOISE = "gyro noise"
@@ -234,7 +234,7 @@ class InertialChain(AtTrueTimes):
         self,
         time: Array,
         shift: float = 0.0,
-        window: float | None = None,
+        window: Window | None = None,
         *,
         of_attitude: bool = False,
     ) -> TwoWay:

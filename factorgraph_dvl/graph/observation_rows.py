@@ -60,6 +60,11 @@ class ObservationRows:
         return self.whole.averaging
 
     @property
+    def averages_in_body(self) -> bool:
+        """Whether its mean is that of velocities in body axes."""
+        return self.whole.averages_in_body
+
+    @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the calibration parameters that it depends on."""
         return self.whole.parameters

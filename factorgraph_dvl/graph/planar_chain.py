@@ -20,7 +20,7 @@ from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.smooth_motion import variance_between
 from factorgraph_dvl.graph.trajectory import epochs_between, reported
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
 # Source of noise of the prior of the motion, and of that of the first state.
 MOTION = "acceleration between states"
@@ -272,7 +272,7 @@ class PlanarChain(AtTrueTimes):
         self,
         time: Array,
         shift: float = 0.0,
-        window: float | None = None,
+        window: Window | None = None,
         *,
         of_attitude: bool = False,
     ) -> Attached:

@@ -28,7 +28,7 @@ from factorgraph_dvl.graph.smooth_motion import (
     variance_between,
 )
 from factorgraph_dvl.sensors.parameters import Parameter
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
 # Source of noise of the prior of the motion.
 MOTION = "acceleration between states"
@@ -300,7 +300,7 @@ class SmoothChain:
         self,
         time: Array,
         shift: float = 0.0,
-        window: float | None = None,
+        window: Window | None = None,
         *,
         of_attitude: bool = False,
     ) -> Attached:

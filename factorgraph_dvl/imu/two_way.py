@@ -29,7 +29,7 @@ from factorgraph_dvl.imu.propagation import (
     motion_at,
 )
 from factorgraph_dvl.imu.window_means import Windows, averaged, windows
-from factorgraph_dvl.sensors.protocol import Linearization, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class TwoWayTransition:
 
 
 def attach_two_way(
-    seg: Segments, time: Array, earth_rate_n: Array, window: float | None = None
+    seg: Segments, time: Array, earth_rate_n: Array, window: Window | None = None
 ) -> TwoWay:
     """Attach times (M,) to both nodes of their segments; those not covered, where nearest.
 
@@ -105,8 +105,8 @@ def attach_two_way(
         Times.
     earth_rate_n : ndarray, shape (3,), rad/s
         Earth rate in n.
-    window : float, optional, s
-        Length of windows about the times, of measurements that are means.
+    window : Window, optional
+        Windows about the times, of measurements that are means.
     """
     known = vars(seg).setdefault("_attached", WeakValueDictionary())
     key = time.tobytes(), earth_rate_n.tobytes(), window
@@ -116,7 +116,7 @@ def attach_two_way(
     return found
 
 
-def _attached(seg: Segments, time: Array, earth_rate_n: Array, window: float | None) -> TwoWay:
+def _attached(seg: Segments, time: Array, earth_rate_n: Array, window: Window | None) -> TwoWay:
     forward, beyond = attach_smoothly(seg, time, earth_rate_n)
     found = None
     if window is not None:

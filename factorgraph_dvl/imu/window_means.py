@@ -7,7 +7,9 @@ integral of the specific force, in the axes in the middle, the velocity in body 
 
 linear in velocity and gravity there. Its mean over the window, and the derivatives of the mean by
 the time of the middle and by the length, follow from running integrals over the samples: what
-vibrates between two measurements is averaged as the sensor averages it.
+vibrates between two measurements is averaged as the sensor averages it. A mean of velocities in n
+is, in the axes in the middle, that of v_b(0) + V(s) + g_b s; by it a lever arm moves from where it
+is at one end to where it is at the other.
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from factorgraph_dvl.geometry.vectors import (
 )
 from factorgraph_dvl.imu.between_samples import Cubics, between_samples, cubics_between
 from factorgraph_dvl.imu.increments import Increments, Partial
-from factorgraph_dvl.sensors.protocol import Linearization, MeanMotion, Motion
+from factorgraph_dvl.sensors.protocol import Linearization, MeanMotion, Motion, Window
 
 # Samples whose running integrals are in memory at once. Chosen: some ten megabytes.
 _CHUNK = 50_000
@@ -70,6 +72,10 @@ class BodyMotion:
         """Return the velocity in body axes, (M, 3), m/s."""
         return rotate(self.turn, v_b) + rotate(self.swept, gravity_b) + self.added
 
+    def over(self, length: Array) -> BodyMotion:
+        """Return it over lengths (M,), s."""
+        return BodyMotion(*(_per_second(each, length) for each in vars(self).values()))
+
     def plus(self, others: BodyMotion, weight: float, own: float = 1.0) -> BodyMotion:
         """Return a weighed sum with others."""
         pairs = zip(vars(self).values(), vars(others).values(), strict=True)
@@ -102,7 +108,7 @@ class Windows:
     force_sigma: Array
 
 
-def windows(inc: Increments, time: Array, length: float) -> Windows:
+def windows(inc: Increments, time: Array, window: Window) -> Windows:
     """Return windows about times (M,).
 
     A window is shorter where the samples begin or end. One of negative length has the effect of a
@@ -114,12 +120,13 @@ def windows(inc: Increments, time: Array, length: float) -> Windows:
         Increments between the samples.
     time : ndarray, shape (M,), s
         Middles of the windows.
-    length : float, s
-        Length of the windows.
+    window : Window
+        Length of the windows, and what is averaged.
     """
+    length, of_body = window
     if length >= SHORTEST:
-        return _of_lengths(inc, time, (length,))[0]
-    short, long = _of_lengths(inc, time, (_SHORT, SHORTEST))
+        return _of_lengths(inc, time, (length,), of_body=of_body)[0]
+    short, long = _of_lengths(inc, time, (_SHORT, SHORTEST), of_body=of_body)
     span = SHORTEST**2 - _SHORT**2
     share = (length * abs(length) - _SHORT**2) / span
     slope = max(2.0 * abs(length), SHORTEST) / span
@@ -140,7 +147,9 @@ def windows(inc: Increments, time: Array, length: float) -> Windows:
     )
 
 
-def _of_lengths(inc: Increments, time: Array, lengths: Sequence[float]) -> list[Windows]:
+def _of_lengths(
+    inc: Increments, time: Array, lengths: Sequence[float], *, of_body: bool
+) -> list[Windows]:
     """Return windows of some lengths as they are, about the same times."""
     order = np.argsort(time, kind="stable")
     middle, since, _ = inc.locate(time[order])
@@ -159,7 +168,7 @@ def _of_lengths(inc: Increments, time: Array, lengths: Sequence[float]) -> list[
         now = run.at(middle[own], since[own])
         for out, half, pair in zip(found, halves, edges, strict=True):
             ends = [run.at(index[own], after[own]) for index, after in pair]
-            out.append(_windows(run, now, ends, half[own]))
+            out.append(_windows(run, now, ends, half[own], of_body=of_body))
     back = np.empty_like(order)
     back[order] = np.arange(order.size)
     return [rows_of(concatenated(parts), back) for parts in found]
@@ -199,7 +208,7 @@ class _Point:
     dV : ndarray, shape (M, 3)
         Integral of the specific force, in the axes at the start.
     integrals : tuple of ndarray
-        Integrals of dRᵀ, of t dRᵀ, of dRᵀ dV and of the rate.
+        Integrals of dRᵀ, of t dRᵀ, of dRᵀ dV, of the rate and of dV.
     rate : ndarray, shape (M, 3), rad/s
         Slope of the integral of the rate.
     signals : Partial
@@ -272,21 +281,44 @@ def _steps(
     crossed = cross(phi, dv)
     added = (dv / 2.0 - crossed / 3.0 + cross(phi, crossed) / 8.0) * h[:, :, 0]
     added = added + cubics.velocity
-    return back, moment, rotate(back, dV) + added, phi
+    gained = dV * h[:, :, 0] + rotate(dR, 0.5 * dv * h[:, :, 0] + cubics.velocity)
+    return back, moment, rotate(back, dV) + added, phi, gained
 
 
-def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Windows:
+def _windows(
+    run: _Run, now: _Point, ends: Sequence[_Point], half: Array, *, of_body: bool
+) -> Windows:
     """Return windows about points of a run from one end to the other."""
-    one, other = ends
     length = 2.0 * half
     here = now.signals.omega
     step = float(np.mean(run.inc.dt))
+    mean, change, lengthened = (_in_body if of_body else _in_n)(now, ends, half)
+    gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
+    return Windows(
+        mean,
+        change.over(length),
+        lengthened.over(length),
+        BodyMotion(
+            -skew(here),
+            np.broadcast_to(IDENTITY, now.dR.shape),
+            now.signals.force,
+            now.signals.alpha,
+        ),
+        gyro / np.sqrt(length),
+        np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length,
+        accel / np.sqrt(length),
+    )
 
-    def per_second(values: Array) -> Array:
-        return values / length.reshape(-1, *[1] * (values.ndim - 1))
 
+def _in_body(
+    now: _Point, ends: Sequence[_Point], half: Array
+) -> tuple[BodyMotion, BodyMotion, BodyMotion]:
+    """Return the mean in body axes, and its derivatives by time and length, times the length."""
+    one, other = ends
+    here = now.signals.omega
     back, moment, moved, angle = (
-        per_second(b - a) for a, b in zip(one.integrals, other.integrals, strict=True)
+        _per_second(b - a, 2.0 * half)
+        for a, b in zip(one.integrals[:4], other.integrals[:4], strict=True)
     )
     # By the axes and the time in the middle what is by those at the start of the run.
     about = moment - now.time[:, None, None] * back
@@ -304,23 +336,55 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], half: Array) -> Win
         return BodyMotion(turn, swept, added, end.rate - here)
 
     before, after = at_end(one, -1.0), at_end(other, 1.0)
-    change = after.plus(before, -1.0)
     lengthened = before.plus(after, 0.5, 0.5).plus(mean, -1.0)
-    gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
-    return Windows(
-        mean,
-        BodyMotion(*(per_second(each) for each in vars(change).values())),
-        BodyMotion(*(per_second(each) for each in vars(lengthened).values())),
-        BodyMotion(
-            -skew(here),
-            np.broadcast_to(IDENTITY, back.shape),
-            now.signals.force,
-            now.signals.alpha,
-        ),
-        gyro / np.sqrt(length),
-        np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length,
-        accel / np.sqrt(length),
+    return mean, after.plus(before, -1.0), lengthened
+
+
+def _in_n(
+    now: _Point, ends: Sequence[_Point], half: Array
+) -> tuple[BodyMotion, BodyMotion, BodyMotion]:
+    """Return the same of the mean in n, in the axes in the middle.
+
+    The rate is that by which a lever arm turns from one end to the other, over the length: of
+    [w x] = (E - E') / length the part that is skew. What is symmetric is of third order.
+    """
+    one, other = ends
+    here, length = now.signals.omega, 2.0 * half
+    bRs = now.dR.transpose(0, 2, 1)
+    gained = _per_second(other.integrals[4] - one.integrals[4], length)
+    added = rotate(bRs, gained - now.dV)
+    turned = [bRs @ end.dR for end in ends]
+    turning = [E @ skew(end.rate) for E, end in zip(turned, ends, strict=True)]
+    across, zero = skew(here), np.zeros_like(now.dR)
+    whole = turned[1] - turned[0]
+    still = np.broadcast_to(IDENTITY, zero.shape)
+    sped = [rotate(bRs, end.dV - now.dV) for end in ends]
+    wide = length[:, None]
+    mean = BodyMotion(still, zero, added, _unskewed(_per_second(whole, length)) - here)
+    change = BodyMotion(
+        -across * wide[:, :, None],
+        still * wide[:, :, None],
+        sped[1] - sped[0] - cross(here, added) * wide,
+        _unskewed(turning[1] - turning[0] - across @ whole),
     )
+    lengthened = BodyMotion(
+        zero,
+        zero,
+        0.5 * (sped[0] + sped[1]) - added,
+        _unskewed(0.5 * (turning[0] + turning[1])) - mean.rate - here,
+    )
+    return mean, change, lengthened
+
+
+def _unskewed(matrix: Array) -> Array:
+    """Return the vectors (M, 3) of the skew parts of matrices (M, 3, 3)."""
+    m = 0.5 * (matrix - matrix.transpose(0, 2, 1))
+    return np.stack([m[:, 2, 1], m[:, 0, 2], m[:, 1, 0]], axis=1)
+
+
+def _per_second(values: Array, length: Array) -> Array:
+    """Return values (M, ...) over lengths (M,), s."""
+    return np.asarray(values / length.reshape(-1, *[1] * (values.ndim - 1)))
 
 
 def averaged(motion: Motion, over: Windows, gravity_n: Array) -> Motion:

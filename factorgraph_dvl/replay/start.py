@@ -232,7 +232,12 @@ def _condensed(
         own_states=_own_states(trial, chain.frame, interval),
         smoothing=chain.segments.increments.chosen_smoothing,
         longest=max(
-            (abs(b.window(evaluation.parameters) or 0.0) for b in problem.bound), default=0.0
+            (
+                abs(window.length)
+                for b in problem.bound
+                if (window := b.window(evaluation.parameters)) is not None
+            ),
+            default=0.0,
         ),
         spurious=spurious,
         noise_factors=problem.white_factors,

@@ -141,6 +141,8 @@ class PointVelocity(_OfPoint):
         Rate of the body relative to that carrier.
     components, noise_groups, correlated : optional
         Components, noise groups and correlated as in `Observation`.
+    averaging, averages_in_body : optional
+        Length and kind of the window over which it averages, as in `Observation`.
     errors : mapping of str to ndarray, optional
         Parameters whose sum, by these derivatives (M, 3, n), is what is measured too much.
     """
@@ -148,6 +150,8 @@ class PointVelocity(_OfPoint):
     measured_l: Array
     omega_cb_b: Array = field(default_factory=lambda: np.zeros(3))
     unit: str = "m/s"
+    averaging: str | None = None
+    averages_in_body: bool = True
 
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included."""

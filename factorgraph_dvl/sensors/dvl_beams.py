@@ -403,7 +403,7 @@ class BeamVelocity:
         Name of the parameter.
     clock : Clock
         Clock of the instrument.
-    averaging : str, optional
+    averaging, averages_in_body : optional
         Name of the length of the window over which it averages.
     """
 
@@ -415,6 +415,7 @@ class BeamVelocity:
     lever_arm: str
     clock: Clock = CLOCK
     averaging: str | None = AVERAGING
+    averages_in_body: bool = True
     label: str = "Beam velocity"
     unit: str = "m/s"
     gate: float | None = None

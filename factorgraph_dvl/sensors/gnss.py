@@ -57,6 +57,8 @@ _AT_REST.setflags(write=False)
 _CLOCK = Clock.of("gnss", prefix="gnss_")
 # No test asks for it: positions of an INS that fall back in turns look like a delay of velocities.
 _DELAY = ParameterSpec("gnss_velocity_delay", "s", labels=SCALAR, nuisance=True)
+# Nor for this one: other sensors have no window that is a whole second.
+_AVERAGING = ParameterSpec("gnss_velocity_averaging", "s", labels=SCALAR, nuisance=True)
 _VELOCITY_CLOCK = LateClock(_CLOCK.offset, _CLOCK.rate, _DELAY)
 TIME_OFFSET = _CLOCK.offset.name
 
@@ -83,6 +85,8 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
     correlated_velocity_std_m_s: Sigma3 | UnsetType = UNSET
     velocity_delay_s: float = 0.0
     velocity_delay_std_s: NonNegative = 0.0
+    velocity_averaging_s: NonNegative = 0.0
+    velocity_averaging_std_s: NonNegative = 0.0
 
     @property
     def velocity_lag_s(self) -> tuple[float, float]:
@@ -142,7 +146,7 @@ class Gnss:
         POSITION_STD_COLUMNS,
         VELOCITY_STD_COLUMNS,
     )
-    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM, *_CLOCK.specs, _DELAY)
+    specs: ClassVar[tuple[ParameterSpec, ...]] = (_LEVER_ARM, *_CLOCK.specs, _DELAY, _AVERAGING)
 
     def __post_init__(self) -> None:
         check_times(self.time, self.source)
@@ -221,6 +225,10 @@ class Gnss:
         settings = msgspec.structs.replace(self.settings, time_offset_s=0.0)
         return replace(self, settings=settings, time=self.time - offset)
 
+    @property
+    def _averages(self) -> bool:
+        return self.settings.velocity_averaging_s + self.settings.velocity_averaging_std_s > 0.0
+
     def carrier(self, time: Array) -> tuple[Array, Array]:
         """Return bRc (M, 3, 3), axes of what carries the antenna to body, and omega_cb_b (M, 3).
 
@@ -239,14 +247,17 @@ class Gnss:
         return bRc @ np.array(self.settings.lever_arm_m), omega_cb_b
 
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the antenna's lever arm, the receiver's clock, and the delay of velocities."""
+        """Return the antenna's lever arm, the receiver's clock, delay and window of velocities."""
         s = self.settings
         lever_arm = Parameter(_LEVER_ARM, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m))
-        delay, std = s.velocity_delay_s, s.velocity_delay_std_s
+        of_velocity = (
+            (_DELAY, s.velocity_delay_s, s.velocity_delay_std_s),
+            (_AVERAGING, s.velocity_averaging_s, s.velocity_averaging_std_s),
+        )
         return (
             lever_arm,
             *_CLOCK.parameters(s),
-            Parameter(_DELAY, np.array([delay]), np.array([std])),
+            *(Parameter(spec, np.array([x]), np.array([std])) for spec, x, std in of_velocity),
         )
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
@@ -300,6 +311,8 @@ class Gnss:
                     bRc=bRc,
                     omega_cb_b=omega_cb_b,
                     noise_groups=HORIZONTAL_AND_UP,
+                    averaging=_AVERAGING.name if self._averages else None,
+                    averages_in_body=False,
                     correlated=expected_correlation(
                         s.velocity_correlation_time_s,
                         s.correlated_velocity_std_m_s,
@@ -312,6 +325,6 @@ class Gnss:
 
     def explain(self, parameter: str, component: int, motion: Motion | None) -> Message:
         """Say why a component of the lever arm or the clock could not be observed."""
-        if parameter in _VELOCITY_CLOCK.names:
+        if parameter in {*_VELOCITY_CLOCK.names, _AVERAGING.name}:
             return message("not_observable.clock")
         return message("not_observable.antenna")

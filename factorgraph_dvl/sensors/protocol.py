@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Literal, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 import numpy as np
 from msgspec import UNSET, UnsetType
@@ -150,6 +150,21 @@ class Linearization:
         return Linearization(self.residual[index], **by_motion, d_parameters=by_parameters)
 
 
+class Window(NamedTuple):
+    """Window over which a sensor averages.
+
+    Parameters
+    ----------
+    length : float
+        Length, s.
+    of_body : bool
+        Whether the mean is that of velocities in body axes, as a DVL takes it; else in n.
+    """
+
+    length: float
+    of_body: bool = True
+
+
 class SensorClock(Protocol):
     """What the stamps of a sensor depend on."""
 
@@ -279,6 +294,10 @@ class Observation(Protocol):
     def averaging(self) -> str | None:
         """Name of the length of the window over which it averages; None = it does not."""
 
+    @property
+    def averages_in_body(self) -> bool:
+        """Whether its mean is that of velocities in body axes; else in n."""
+
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the (M, d) standard deviations of the residual.
 
@@ -305,6 +324,7 @@ class PlainObservation:
     scale_walk: ScaleWalk | None = None
     independent: bool = False
     averaging: str | None = None
+    averages_in_body: bool = True
 
 
 class ObservationByRows(PlainObservation):

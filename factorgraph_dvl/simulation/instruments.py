@@ -209,6 +209,7 @@ class GnssTruth(ClockedInstrument, frozen=True, kw_only=True):
     velocity_correlated_share: Share = 0.0
     velocity_correlation_time_s: float | Vector3 = 2.0
     velocity_delay_s: float = 0.0
+    velocity_averaging_s: NonNegative = 0.0
     outliers: Outliers | None = None
     jumps: Jumps | None = None
     outages_s: tuple[Interval, ...] = ()

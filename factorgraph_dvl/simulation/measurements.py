@@ -116,10 +116,15 @@ def simulate_gnss(
     state = motion.ship_at(time)
     nRs = rotation_from_rph(state.rph, scenario.body_axes)
     position, arm_n = state.geodetic, apply(nRs, np.array(truth.lever_arm_m))
-    if truth.velocity_delay_s:
-        state = motion.ship_at(np.clip(time - truth.velocity_delay_s, 0.0, motion.duration))
+
+    def velocity_at(time: Array, _: IntArray) -> Array:
+        state = motion.ship_at(time)
         nRs = rotation_from_rph(state.rph, scenario.body_axes)
-    velocity = state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
+        return state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
+
+    half = 0.5 * truth.velocity_averaging_s
+    middle = np.clip(time - truth.velocity_delay_s, half, motion.duration - half)
+    velocity = mean_over(velocity_at, motion, middle, truth.velocity_averaging_s)
     white = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
     error = np.sqrt(1.0 - truth.correlated_share) * white
     geodetic = displaced(position, arm_n + error if scenario.noise else arm_n)
@@ -138,11 +143,14 @@ def simulate_gnss(
         position_std=unknown,
         velocity_std=unknown.copy(),
     )
-    late = truth.velocity_delay_s
+    of_velocity = {
+        "gnss_velocity_delay_s": truth.velocity_delay_s,
+        "gnss_velocity_averaging_s": truth.velocity_averaging_s,
+    }
     return gnss, {
         "gnss_lever_arm_m": np.array(truth.lever_arm_m),
         "gnss_time_offset_s": np.zeros(1),
-        **({"gnss_velocity_delay_s": np.array([late])} if late else {}),
+        **{name: np.array([value]) for name, value in of_velocity.items() if value},
     }
 
 

@@ -175,11 +175,11 @@ def minimise(
 
 
 class _End(Enum):
-    """Why a minimisation ends: at a minimum, low enough, with clocks held, or without a step."""
+    """Why a minimisation ends: at a minimum, low enough, with fixed clocks, or without a step."""
 
     MINIMUM = auto()
     ENOUGH = auto()
-    HELD = auto()
+    FIXED = auto()
     STUCK = auto()
 
 
@@ -199,22 +199,26 @@ class _Search:
         Ordering of the quick elimination.
     sizes : dict of int to int
         Dimensions of the variables.
-    tolerance, proven, enough : float or bool
-        As of `minimise`; `enough` as a cost.
+    tolerance : float
+        Promised decrease of the cost below which the minimum is reached.
+    proven : bool
+        Whether QR must confirm the minimum.
+    enough : float
+        Cost below which no minimum is needed.
     iteration : int
         Accepted and refused steps.
     damping : float
-        That of the next step.
+        Damping of the next step.
     failed : float
         Greatest damping with which a step failed since the cost last fell.
     careful : bool
         Whether steps are from QR, because one may have been bad for want of digits.
-    held : bool
+    fixed : bool
         Whether clocks stay where they are.
     promised, before : float
         What the linear model says that the last step and the one before take off the cost.
     root : SquareRootInformation or None
-        From QR at the last step, if it was.
+        Information from QR at the last step; None if that was from Cholesky.
     past : list of tuple of gtsam.Values and gtsam.VectorValues
         Where the last steps began, and what these were by the linear model there.
     """
@@ -231,7 +235,7 @@ class _Search:
     damping: float = 0.0
     failed: float = -1.0
     careful: bool = False
-    held: bool = False
+    fixed: bool = False
     promised: float = np.inf
     before: float = np.inf
     root: SquareRootInformation | None = None
@@ -257,15 +261,15 @@ class _Search:
         if end is _End.ENOUGH:
             return Minimum(self.evaluation, None, False, self.iteration)
         delta = self._from_qr(self.gaussian)
-        settled = end is _End.HELD or self._is_within(delta)
+        settled = end is _End.FIXED or self._is_within(delta)
         return Minimum(self.evaluation, self.root, settled, self.iteration)
 
     def _step(self) -> gtsam.VectorValues:
-        """Return the step of the linear model, damped and with clocks held as it is to be."""
+        """Return the step of the linear model, damped, and with fixed clocks, as it is to be."""
         graph = self.gaussian
         if self.damping > 0.0:
             graph = _damped(graph, self.evaluation.values, self.damping)
-        if self.held:
+        if self.fixed:
             graph = _held(graph, self.problem.clock_keys)
         last = self.proven and self.damping == 0.0 and self.promised < _NEAR
         delta = None if self.careful or last else quick_step(graph, self.ordering)
@@ -296,7 +300,7 @@ class _Search:
         return self.promised > max(self.tolerance, _NEARLY)
 
     def _trial(self, delta: gtsam.VectorValues) -> Evaluation | None:
-        """Return where a step leads to; None if clocks are to be held instead."""
+        """Return where a step leads to; None if clocks are fixed first."""
         problem, evaluation, promised = self.problem, self.evaluation, self.promised
         if self._is_large:
             changed = self.past if promised > _POOR_GAIN * self.before else self.past[-1:]
@@ -306,9 +310,9 @@ class _Search:
         self.before = promised
         fallen = evaluation.cost - trial.cost
         if promised > _WITHIN and fallen < _POOR_GAIN * promised and self.damping == 0.0:
-            little = not self.held and fallen < _HARDLY * promised
+            little = not self.fixed and fallen < _HARDLY * promised
             if little and _at_jump(problem, evaluation, delta):
-                self.held, self.past = True, []
+                self.fixed, self.past = True, []
                 return None
             bent = _bent(problem, evaluation, delta, self.ordering)
             trial = trial if bent is evaluation else min(trial, bent, key=lambda each: each.cost)
@@ -327,14 +331,14 @@ class _Search:
             self.failed = -1.0
         if lower:
             self.evaluation = trial
-        if ended and self.damping == 0.0 and self._is_proven and not self.held:
+        if ended and self.damping == 0.0 and self._is_proven and not self.fixed:
             return _End.MINIMUM
-        held = ended and self.damping == 0.0 and self.held
-        if not held and self.evaluation.cost < self.enough:
+        fixed = ended and self.damping == 0.0 and self.fixed
+        if not fixed and self.evaluation.cost < self.enough:
             return _End.ENOUGH
         self.gaussian = self.problem.linearize(self.evaluation)
-        if held:
-            return _End.HELD
+        if fixed:
+            return _End.FIXED
         if small or gain > _GOOD_GAIN:
             self.damping = self.damping / 10.0 if self.damping > _FIRST_DAMPING else 0.0
         elif gain < _POOR_GAIN:
@@ -344,8 +348,8 @@ class _Search:
 
     def _refused(self, delta: gtsam.VectorValues) -> _End | None:
         """Damp the next step, or say that none lowers the cost."""
-        if self.damping == 0.0 and self.held and self.promised < _WITHIN:
-            return _End.HELD
+        if self.damping == 0.0 and self.fixed and self.promised < _WITHIN:
+            return _End.FIXED
         if self.damping == 0.0 and self._is_proven and self._is_within(delta):
             return _End.MINIMUM
         if not self.careful and self.root is None:

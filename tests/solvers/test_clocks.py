@@ -62,6 +62,29 @@ def test_a_late_velocity_is_estimated_where_that_is_stated():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("std", [0.0, 0.5])
+def test_velocities_that_are_means_show_the_antenna_where_it_is(std):
+    """Differences of positions over two seconds: as instantaneous ones, 25 sigma off in height."""
+    sea = {
+        "roll": [{"amplitude_deg": 6, "frequency_hz": 0.15}],
+        "pitch": [{"amplitude_deg": 3, "frequency_hz": 0.2, "phase_deg": 60}],
+        "heave": [{"amplitude_m": 0.3, "frequency_hz": 0.17}],
+    }
+    means = {"velocity_averaging_s": 2.0, "velocity_delay_s": 1.0}
+    antenna = {"velocity_std_m_s": [0.02] * 3, "lever_arm_m": [0.5, -2.0, 6.0], "rate_hz": 1}
+    claims = {"gnss": {**means, "velocity_averaging_std_s": std, "lever_arm_std_m": [0.1] * 3}}
+    trial = simulate(scenario(noise=True, sway=sea, gnss=means | antenna, trial=claims), 3)
+    solution = solve(trial, rate_hz=1.0)
+    for name in ("gnss_lever_arm_m", "misalignment_deg", "scale_error", "lever_arm_m"):
+        e = solution.estimate(name)
+        assert np.all(np.abs(e.value - trial.calibration_truth[name]) < 4.0 * e.std), name
+    if std:
+        found = solution.estimate("gnss_velocity_averaging_s")
+        assert abs(found.value[0] - 2.0) < 4.0 * found.std[0] < 0.3
+    assert solution.verdict.grade == "good"
+
+
+@pytest.mark.slow
 def test_offsets_and_rates_of_two_clocks_are_found():
     trial = simulate(scenario(noise=True, gnss=GNSS, trial=FREE), 3)
     middle = 0.5 * (trial.imu.time[0] + trial.imu.time[-1])
