@@ -88,7 +88,7 @@ class PendingMeasurements:
     def __init__(self, body_axes: BodyAxes) -> None:
         self._body_axes = body_axes
         self._records: dict[str, list[Aid]] = {}
-        self._clocks: dict[str, SensorClock | None] = {}
+        self._clocks: dict[str, tuple[SensorClock, ...]] = {}
         self.rejected: Counter[str] = Counter()
 
     @property
@@ -132,7 +132,7 @@ class PendingMeasurements:
         Returns
         -------
         tuple of (Aid, ndarray) or None
-            Rows and their true times, s; None if nothing is due.
+            Rows and their true times, s, the latest if they have several; None if nothing is due.
         """
         records = self._records.pop(section)
         # Many at once are fewer than one by one.
@@ -140,9 +140,9 @@ class PendingMeasurements:
             records = [joined(records)]
 
         def true_times(record: Aid) -> Array:
-            clock = None if frame is None else self._clock(record, frame)
-            lag = 0.0 if clock is None else clock.lag(record.time, values, clock_zero)
-            return np.asarray(record.time - lag)
+            clocks = () if frame is None else self._clocks_of(record, frame)
+            lags = [clock.lag(record.time, values, clock_zero) for clock in clocks]
+            return np.asarray(record.time - np.min(lags, axis=0) if lags else record.time)
 
         taken: list[tuple[Aid, Array]] = []
         left: list[Aid] = []
@@ -169,14 +169,15 @@ class PendingMeasurements:
         later = [r.time[r.time > time] for r in self._records.get(section, [])]
         return min((float(t.min()) for t in later if t.size), default=np.inf)
 
-    def _clock(self, record: Aid, frame: LocalFrame) -> SensorClock | None:
-        """Return the clock of a sensor, None if it is that of the IMU or not known yet."""
+    def _clocks_of(self, record: Aid, frame: LocalFrame) -> tuple[SensorClock, ...]:
+        """Return the clocks of a sensor, none if it has that of the IMU or is not known yet."""
         section = record.section
         if section not in self._clocks:
             observations = record.observations(frame, self._body_axes)
             if not observations:
-                return None
-            self._clocks[section] = observations[0].clock
+                return ()
+            clocks = (o.clock for o in observations)
+            self._clocks[section] = tuple(clock for clock in clocks if clock is not None)
         return self._clocks[section]
 
 

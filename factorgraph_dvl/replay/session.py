@@ -31,6 +31,7 @@ from factorgraph_dvl.replay.initializer import Initializer
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
+from factorgraph_dvl.sensors.gnss import Gnss
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
@@ -344,27 +345,39 @@ class Replay:
             found = self._due(section, end)
             if found is None:
                 continue
-            record, true = found
             if section not in nav.start.sections:
                 # Its parameters are not in the graph yet.
                 self._initializer.solve_by(end)
                 continue
-            now = true >= nav.time - SAME_TIME
-            if now.all():
-                out.append(record)
-                continue
-            if now.any():
-                out.append(rows_of(record, now))
-            for i in np.flatnonzero(~now).tolist():
-                row = rows_of(record, np.array([i]))
-                k = nav.node_before(float(true[i]))
-                if k is not None:
-                    late.setdefault(k, []).append(row)
-                else:
-                    self._count_late(nav, row)
+            for record, true in self._by_clock(nav, *found):
+                now = true >= nav.time - SAME_TIME
+                if now.all():
+                    out.append(record)
+                    continue
+                if now.any():
+                    out.append(rows_of(record, now))
+                for i in np.flatnonzero(~now).tolist():
+                    row = rows_of(record, np.array([i]))
+                    k = nav.node_before(float(true[i]))
+                    if k is not None:
+                        late.setdefault(k, []).append(row)
+                    else:
+                        self._count_late(nav, row)
         if late:
             nav.correct(late)
         return out
+
+    def _by_clock(self, nav: Navigator, record: Aid, true: Array) -> Iterator[tuple[Aid, Array]]:
+        """Yield what was measured by each clock of a sensor, and its true times."""
+        parts = record.of_one_clock() if isinstance(record, Gnss) else (record,)
+        if parts[0] is record:
+            yield record, true
+            return
+        for part in parts:
+            (observed,) = part.observations(nav.start.frame, nav.start.body_axes)
+            assert observed.clock is not None
+            lag = observed.clock.lag(part.time, nav.values, nav.start.clock_zero)
+            yield part, np.asarray(part.time - lag)
 
     def _count_late(self, nav: Navigator, row: Aid) -> None:
         """Count a measurement that is older than all states that can be corrected."""

@@ -32,6 +32,7 @@ from factorgraph_dvl.sensors.records import (
     check_range,
     check_times,
     named_columns,
+    rows_of,
     stack,
 )
 from factorgraph_dvl.sensors.turntable_motion import TurntableMotion
@@ -224,6 +225,16 @@ class Gnss:
             return self
         settings = msgspec.structs.replace(self.settings, time_offset_s=0.0)
         return replace(self, settings=settings, time=self.time - offset)
+
+    def of_one_clock(self) -> tuple[Self, ...]:
+        """Return positions and velocities apart where these are late beside them, else itself."""
+        s = self.settings
+        if s.velocity_delay_s == 0.0 and s.velocity_delay_std_s == 0.0:
+            return (self,)
+        absent = np.full_like(self.geodetic, np.nan)
+        parts = replace(self, velocity=absent), replace(self, geodetic=absent)
+        measured = [np.logical_not(part.missing) for part in parts]
+        return tuple(rows_of(p, m) for p, m in zip(parts, measured, strict=True) if m.any())
 
     @property
     def _averages(self) -> bool:

@@ -119,6 +119,32 @@ def test_a_dvl_that_averages():
     assert 0.9 < np.sqrt(np.nanmean(ratio**2)) < 1.1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("delay", "window"), [(0.5, 1.0), (1.0, 0.0), (-0.3, 0.0)])
+def test_gnss_velocities_that_are_late_beside_positions(delay, window):
+    """A second of positions makes each of them: states before the newest one, and two at once."""
+    swell = [{"amplitude_deg": 4, "frequency_hz": 0.3, "phase_deg": 0}]
+    velocity = {"velocity_delay_s": delay, "velocity_averaging_s": window}
+    scene = config(
+        "seed-a-phase-90",
+        manoeuvres=TURNS,
+        sway={"roll": swell, "pitch": swell},
+        gnss=velocity,
+        trial={"gnss": velocity},
+    )
+    trial = simulate(scene, 1)
+    as_the_batch(trial)
+    innovations = []
+    replay(trial, rate_hz=5.0, watch=lambda u: innovations.extend(u.innovations))
+    found = {label: 0 for label in ("GNSS position", "GNSS velocity")}
+    for i in innovations:
+        if i.label in found:
+            found[i.label] += int(np.isfinite(i.residual).all(axis=1).sum())
+    # Those of the first seconds are late where states begin.
+    assert found["GNSS position"] > 100
+    assert found["GNSS velocity"] > 0.9 * found["GNSS position"]
+
+
 def test_star_vectors_one_epoch_at_a_time():
     trial = simulate(config("seed-a-star", manoeuvres=TURNS), 1)
     (star,) = trial.others
