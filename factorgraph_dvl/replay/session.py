@@ -31,8 +31,7 @@ from factorgraph_dvl.replay.initializer import Initializer
 from factorgraph_dvl.replay.navigator import Navigator
 from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
-from factorgraph_dvl.sensors.gnss import Gnss
-from factorgraph_dvl.sensors.protocol import Aid
+from factorgraph_dvl.sensors.protocol import Aid, ClocksAid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.state_times import CLOSEST
@@ -369,7 +368,7 @@ class Replay:
 
     def _by_clock(self, nav: Navigator, record: Aid, true: Array) -> Iterator[tuple[Aid, Array]]:
         """Yield what was measured by each clock of a sensor, and its true times."""
-        parts = record.of_one_clock() if isinstance(record, Gnss) else (record,)
+        parts = record.of_one_clock() if isinstance(record, ClocksAid) else (record,)
         if parts[0] is record:
             yield record, true
             return

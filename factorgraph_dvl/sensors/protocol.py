@@ -468,6 +468,14 @@ class AttitudeAid(Aid, Protocol):
         """Return the attitudes that were measured, in `frame`."""
 
 
+@runtime_checkable
+class ClocksAid(Aid, Protocol):
+    """An aid that may measure by several clocks."""
+
+    def of_one_clock(self) -> tuple[Aid, ...]:
+        """Return what was measured by each of its clocks, itself if it has one."""
+
+
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:
     """Return the standard deviation, (M,), m/s, of omega x l from that of omega.
 
