@@ -129,15 +129,29 @@ def claim(
         yield work
     finally:
         _claimed.pop(mine, None)
-        # What could not be removed stays there for the next run.
-        if not ((work / _OLD).exists() or (work / _NEW).exists()):
-            (work / _OWNED).unlink(missing_ok=True)
-        with suppress(OSError):
-            work.rmdir()
-        os.close(lock)
-        with suppress(OSError):
-            for parent in made:
-                parent.rmdir()
+        try:
+            _release(work, lock, made)
+        except KeyboardInterrupt:
+            _release(work, lock, made)
+            raise
+        finally:
+            os.close(lock)
+
+
+def _release(work: Path, lock: int, made: Sequence[Path]) -> None:
+    """Remove a working folder that is locked, and folders made for it that are empty."""
+    with suppress(FileNotFoundError):
+        # What has its name now may be another run's.
+        if os.path.samestat(os.fstat(lock), work.stat()):
+            shutil.rmtree(work / _PARTIAL, ignore_errors=True)
+            # What could not be removed stays there for the next run.
+            if not ((work / _OLD).exists() or (work / _NEW).exists()):
+                (work / _OWNED).unlink(missing_ok=True)
+            with suppress(OSError):
+                work.rmdir()
+    with suppress(OSError):
+        for parent in made:
+            parent.rmdir()
 
 
 @contextmanager

@@ -412,3 +412,26 @@ def test_an_output_file_takes_the_place_of_no_device(tmp_path, capsys):
     assert run("export", trial, "--to", "netcdf", "--out", pipe, "--force") == 2
     assert "is a pipe or a device; expected the name of a file" in capsys.readouterr().err
     assert pipe.is_fifo()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"), [(shutil, "rmtree"), (Path, "unlink"), (Path, "rmdir"), (os, "close")]
+)
+def test_an_interrupt_while_a_run_cleans_up_leaves_nothing(tmp_path, monkeypatch, owner, name):
+    done, came = getattr(owner, name), []
+
+    def interrupted(*args, **options):
+        if not came:
+            came.append(name)
+            raise KeyboardInterrupt
+        return done(*args, **options)
+
+    def fail():
+        with new_folder(tmp_path / "deep" / "out", owned=OWNED):
+            monkeypatch.setattr(owner, name, interrupted)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
+    assert came == [name]
+    assert list(tmp_path.iterdir()) == []
