@@ -103,14 +103,14 @@ def best_window(values: Array, dt: float, sigma: float) -> int:
         by_noise = sigma**2 * (1.0 - 2.0 * weights[half] + kept)
         by_motion = max(float(np.mean(moved)) - by_noise, 0.0)
         chance = 1.25 * by_noise * np.sqrt(2.0 * window / few.size)
-        by_sway = max(float(np.median(_means(moved, _BLOCK))) - by_noise - chance, 0.0)
+        by_sway = max(float(np.median(block_means(moved, _BLOCK))) - by_noise - chance, 0.0)
         error = by_motion + (_REPEATED - 1.0) * by_sway + sigma**2 * kept
         if error < best:
             best, width = error, window
     return width
 
 
-def _means(values: Array, size: int) -> Array:
+def block_means(values: Array, size: int) -> Array:
     """Return the means of blocks of so many values, (B,)."""
     blocks = max(values.size // size, 1)
     whole = values[: blocks * (values.size // blocks)]

@@ -29,7 +29,7 @@ _BANDS = 4
 _APART = 64
 # Stretches of a first look, and the excess over the stated noise below which it is enough. Chosen:
 # their noise is known to 1 %.
-_FIRST_LOOK = 600
+FIRST_LOOK = 600
 _CLEARLY_LESS = 1.05
 # Stretches that are transformed at once. Chosen: some MB.
 _BLOCK = 1024
@@ -68,9 +68,7 @@ def white_noise(imu: Imu, *, stretches: int | None = None) -> WhiteNoise | None:
     stretches : int, optional
         About how many of its stretches are looked at; all by default.
     """
-    parts, dt, regular = unbroken_parts(imu.time)
-    longest = int(np.argmax(np.diff(parts)))
-    part = slice(parts[longest], parts[longest + 1])
+    _, part, dt, regular = unbroken_parts(imu.time)
     inner = part.stop - part.start - 1
     if inner < _LEAST_SAMPLES or not regular:
         return None
@@ -78,30 +76,37 @@ def white_noise(imu: Imu, *, stretches: int | None = None) -> WhiteNoise | None:
     return WhiteNoise(_lowest(imu.gyro[part], dt, every), _lowest(imu.accel[part], dt, every))
 
 
-def unbroken_parts(time: Array) -> tuple[IntArray, float, bool]:
-    """Return where parts of a record without gaps begin and end, and how samples follow.
+class UnbrokenParts(NamedTuple):
+    """Parts of a record without gaps, and how samples follow.
 
     Parameters
     ----------
-    time : ndarray, shape (N,), s
-        Times of the samples.
-
-    Returns
-    -------
     edges : ndarray of int, shape (P + 1,)
         First sample of each part, and the number of samples.
+    longest : slice
+        Samples of the longest part.
     interval : float, s
         Usual interval of the samples, infinite where there is only one.
     regular : bool
         Whether samples of the longest part follow at that interval.
     """
+
+    edges: IntArray
+    longest: slice
+    interval: float
+    regular: bool
+
+
+def unbroken_parts(time: Array) -> UnbrokenParts:
+    """Return the parts without gaps of samples at times (N,), s."""
     step = np.diff(time)
     dt = float(np.median(step)) if step.size else np.inf
     edges = np.concatenate([[0], np.flatnonzero(step > _LOST * dt) + 1, [time.size]])
-    longest = int(np.argmax(np.diff(edges)))
-    inner = step[edges[longest] : edges[longest + 1] - 1]
+    first = int(np.argmax(np.diff(edges)))
+    longest = slice(int(edges[first]), int(edges[first + 1]))
+    inner = step[longest.start : longest.stop - 1]
     unlike = np.quantile(np.abs(inner / dt - 1.0), 0.99) if inner.size else np.inf
-    return edges, dt, bool(unlike <= _REGULAR)
+    return UnbrokenParts(edges, longest, dt, bool(unlike <= _REGULAR))
 
 
 def with_recorded_noise(imu: Imu) -> Imu:
@@ -113,7 +118,7 @@ def with_recorded_noise(imu: Imu) -> Imu:
         IMU with stated noise; where the record's bound is larger, it takes its place.
     """
     stated = (imu.settings.gyro_noise_root_psd, imu.settings.accel_noise_root_psd)
-    found = white_noise(imu, stretches=_FIRST_LOOK)
+    found = white_noise(imu, stretches=FIRST_LOOK)
     if found is None or all(f < _CLEARLY_LESS * s for f, s in zip(found, stated, strict=True)):
         return imu
     found = white_noise(imu)

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.ndimage import correlate1d
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.imu.noise import unbroken_parts, white_noise
+from factorgraph_dvl.imu.interpolation import block_means
+from factorgraph_dvl.imu.noise import FIRST_LOOK, unbroken_parts, white_noise
 from factorgraph_dvl.sensors.imu import Imu
 
 # Frequency, Hz, above which motion is vibration, half-width of the filter that takes it off, s,
@@ -26,8 +27,6 @@ _LEAK = 1e-3
 _SURE = 5.0
 # Samples at most that are searched for it. Chosen: minutes of motion.
 _ENOUGH = 60_000
-# Stretches of the record from which its noise is found. Chosen: known to 1 %.
-_STRETCHES = 600
 
 
 def without_vibration(imu: Imu) -> Imu:
@@ -41,13 +40,12 @@ def without_vibration(imu: Imu) -> Imu:
     imu : Imu
         Record. Parts without gaps that are shorter than the filter stay as they are.
     """
-    parts, dt, regular = unbroken_parts(imu.time)
+    parts, longest, dt, regular = unbroken_parts(imu.time)
     half = round(_FILTER / dt)
     if not regular or 4.0 * _VIBRATION * dt > 1.0 or half == 0:
         return imu
-    longest = max(pairwise(parts), key=lambda part: part[1] - part[0])
-    few = slice(longest[0], min(longest[1], longest[0] + _ENOUGH))
-    found = white_noise(imu, stretches=_STRETCHES) or (0.0, 0.0)
+    few = slice(longest.start, min(longest.stop, longest.start + _ENOUGH))
+    found = white_noise(imu, stretches=FIRST_LOOK) or (0.0, 0.0)
     stated = imu.settings.gyro_noise_root_psd, imu.settings.accel_noise_root_psd
     signals = imu.gyro, imu.accel
     if not any(
@@ -74,9 +72,7 @@ def _vibrates(values: Array, dt: float, sigma: float) -> bool:
     by_noise = sigma**2 * float(passed @ passed)
     chance = 1.25 * by_noise * np.sqrt(2.0 / values.size)
     # A step is fast only for a short time.
-    size = 2 * half
-    whole = np.mean(fast**2, axis=1)[: values.shape[0] // size * size]
-    power = float(np.median(whole.reshape(-1, size).mean(axis=1)))
+    power = float(np.median(block_means(np.mean(fast**2, axis=1), 2 * half)))
     return power > by_noise + _SURE * chance + _LEAK**2 * float(np.mean(values**2))
 
 
