@@ -17,6 +17,10 @@ from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
+# Sources of noise: the prior of the motion, and that of the first state.
+MOTION = "acceleration between states"
+FIRST_STATE = "prior of the first state"
+
 
 @dataclass(frozen=True)
 class StepRows:
@@ -265,3 +269,63 @@ class AtTrueTimes:
     def _states(self, values: gtsam.Values, nodes: range) -> Any:
         """Return the states of some nodes in a row."""
         raise NotImplementedError
+
+
+class WithoutImu:
+    """What chains have in common whose nodes are tied by white acceleration, and by nothing else.
+
+    They have `node_time`, (K,), s.
+    """
+
+    node_time: Array
+    interpolates: ClassVar[bool] = True
+    step_source: ClassVar[str | None] = MOTION
+    first_state: ClassVar[str] = FIRST_STATE
+
+    @property
+    def count(self) -> int:
+        """Number of its segments, from node to node."""
+        return self.node_time.size - 1
+
+    @property
+    def duration(self) -> float:
+        """How long the motion is known, s."""
+        return float(self.node_time[-1] - self.node_time[0])
+
+    @property
+    def middle(self) -> float:
+        """Middle of the record, s."""
+        return 0.5 * float(self.node_time[0] + self.node_time[-1])
+
+    @property
+    def constants(self) -> dict[int, int]:
+        """Dimensions of the variables that all nodes share, by key: none."""
+        return {}
+
+    def nodes_of(self, block: slice) -> range:
+        """Return the nodes from the first of some steps to that of the steps after them."""
+        return range(block.start, block.stop + (block.stop == self.count))
+
+    def add_prior(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        parameters: Sequence[Parameter],
+        key_of: Mapping[str, int],
+        constants_prior: ConstantsPrior | None,
+    ) -> Sequence[Parameter]:
+        """Add nothing: it has no constants; return all parameters."""
+        return parameters
+
+    def mean_constants(self, states: Any) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
+        """Yield nothing: it has no parameters of its own."""
+        yield from ()
+
+    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
+        """Return None: there is no IMU."""
+
+    def release(self) -> None:
+        """Free nothing: nothing is kept for binding measurements."""
+
+    def sources(self, letters: str) -> dict[str, slice]:
+        """Return the sources of noise of one of its factors, and which rows each has."""
+        return {self.first_state: slice(None)}

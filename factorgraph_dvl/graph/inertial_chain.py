@@ -24,7 +24,7 @@ from factorgraph_dvl.geometry.rotations import (
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import AtTrueTimes, StepRows
+from factorgraph_dvl.graph.chain import FIRST_STATE, AtTrueTimes, StepRows
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.node_jacobian import two_way_jacobian
@@ -55,7 +55,6 @@ from factorgraph_dvl.trial import Trial
 
 GYRO_NOISE = "gyro noise"
 ACCEL_NOISE = "accelerometer noise"
-FIRST_STATE = "prior of the first state"
 GAP = "motion while the IMU is silent"
 WALK = "random walk of {}"
 

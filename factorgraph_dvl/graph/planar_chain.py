@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -15,16 +15,11 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body, rotation_from_rph
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import AtTrueTimes, StepRows
-from factorgraph_dvl.graph.priors import ConstantsPrior
+from factorgraph_dvl.graph.chain import MOTION, AtTrueTimes, StepRows, WithoutImu
 from factorgraph_dvl.graph.smooth_motion import variance_between
 from factorgraph_dvl.graph.trajectory import epochs_between, reported
-from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
-# Source of noise of the prior of the motion, and of that of the first state.
-MOTION = "acceleration between states"
-FIRST_STATE = "initial position"
 # Dimensions of a state: position and velocity, east and north.
 SIZE = 4
 # Mean radius of the Earth, m. Measured: over 10 km a sphere errs by 3 cm in height.
@@ -129,7 +124,7 @@ class Between:
 
 
 @dataclass(frozen=True)
-class PlanarChain(AtTrueTimes):
+class PlanarChain(WithoutImu, AtTrueTimes):
     """Nodes of a planar trial, tied by white acceleration in the plane.
 
     Parameters
@@ -163,28 +158,12 @@ class PlanarChain(AtTrueTimes):
     body_axes: BodyAxes
     heading_bias: str | None = None
     block: slice | None = None
-    interpolates: ClassVar[bool] = True
-    step_source: ClassVar[str | None] = MOTION
-
-    @property
-    def count(self) -> int:
-        """Number of its segments, from node to node."""
-        return self.node_time.size - 1
-
-    @property
-    def duration(self) -> float:
-        """How long the motion is known, s."""
-        return float(self.node_time[-1] - self.node_time[0])
+    first_state: ClassVar[str] = "initial position"
 
     @property
     def log_determinant(self) -> float:
         """Log det of the covariance of the steps, but for what their length makes it."""
         return 2.0 * float(np.linalg.slogdet(self.density)[1].sum())
-
-    @property
-    def middle(self) -> float:
-        """Middle of the record, s."""
-        return 0.5 * float(self.node_time[0] + self.node_time[-1])
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -194,11 +173,6 @@ class PlanarChain(AtTrueTimes):
             noise = gtsam.noiseModel.Diagonal.Sigmas(self.start_std, False)
             graph.addPriorVector(keys.node(0), self.start, noise)
         return graph
-
-    @property
-    def constants(self) -> dict[int, int]:
-        """Dimensions of the variables that all nodes share, by key: none."""
-        return {}
 
     @property
     def sizes(self) -> list[int]:
@@ -219,10 +193,6 @@ class PlanarChain(AtTrueTimes):
     def part(self, block: slice) -> PlanarChain:
         """Return the part of some steps in a row; states keep their keys."""
         return replace(self, block=block)
-
-    def nodes_of(self, block: slice) -> range:
-        """Return the nodes from the first of some steps to that of the steps after them."""
-        return range(block.start, block.stop + (block.stop == self.count))
 
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
         """Return the keys of the states of nodes."""
@@ -405,25 +375,6 @@ class PlanarChain(AtTrueTimes):
             MOTION, names, block.start, residual, np.concatenate([before, after], axis=2)
         )
 
-    def add_prior(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        parameters: Sequence[Parameter],
-        key_of: Mapping[str, int],
-        constants_prior: ConstantsPrior | None,
-    ) -> Sequence[Parameter]:
-        """Add nothing: it has no constants; return all parameters."""
-        return parameters
-
-    def mean_constants(
-        self, states: PlanarStates
-    ) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
-        """Yield nothing: it has no parameters of its own."""
-        yield from ()
-
-    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
-        """Return None: there is no IMU."""
-
     def trajectory(
         self, states: PlanarStates, P: Array, body_axes: BodyAxes, rate_hz: float
     ) -> Trajectory:
@@ -461,19 +412,12 @@ class PlanarChain(AtTrueTimes):
         rph_cov[:, 2, 2] = self.recorded.heading_std**2
         return replace(out, rph=rph, rph_cov=rph_cov)
 
-    def release(self) -> None:
-        """Free nothing: nothing is kept for binding measurements."""
-
-    def sources(self, letters: str) -> dict[str, slice]:
-        """Return the sources of noise of one of its factors, and which rows each has."""
-        return {FIRST_STATE: slice(None)}
-
     def assumed(self) -> dict[str, str]:
         """Return what is assumed of each of these sources, as text."""
         density = np.sqrt(np.median(np.trace(self.density, axis1=1, axis2=2)) / 2.0)
         text = f"{density:.2g} m/s/√s"
         if np.isfinite(self.start_std).all():
-            return {MOTION: text, FIRST_STATE: f"{self.start_std[:2].max():.2g} m"}
+            return {MOTION: text, self.first_state: f"{self.start_std[:2].max():.2g} m"}
         return {MOTION: text}
 
 

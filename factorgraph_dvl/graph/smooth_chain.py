@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -14,8 +13,8 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import StepRows
-from factorgraph_dvl.graph.priors import ConstantsPrior, loose_diagonal
+from factorgraph_dvl.graph.chain import MOTION, StepRows, WithoutImu
+from factorgraph_dvl.graph.priors import loose_diagonal
 from factorgraph_dvl.graph.smooth_motion import (
     Between,
     Place,
@@ -27,12 +26,8 @@ from factorgraph_dvl.graph.smooth_motion import (
     turns_of,
     variance_between,
 )
-from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 
-# Source of noise of the prior of the motion.
-MOTION = "acceleration between states"
-FIRST_STATE = "prior of the first state"
 # Names of the rows of a step.
 _COMPONENTS = tuple(
     f"{kind} {axis}"
@@ -90,7 +85,7 @@ class ChainStates(SmoothStates):
 
 
 @dataclass(frozen=True)
-class SmoothChain:
+class SmoothChain(WithoutImu):
     """Nodes of a trial without IMU, and the prior of their motion.
 
     Position and velocity of a node are at its time by one clock, attitude and rate at another by
@@ -132,18 +127,6 @@ class SmoothChain:
     clock: str | None = None
     resolution: float = 0.0
     block: slice | None = None
-    interpolates: ClassVar[bool] = True
-    step_source: ClassVar[str | None] = MOTION
-
-    @property
-    def count(self) -> int:
-        """Number of its segments, from node to node."""
-        return self.node_time.size - 1
-
-    @property
-    def duration(self) -> float:
-        """How long the motion is known, s."""
-        return float(self.node_time[-1] - self.node_time[0])
 
     @property
     def attitude_shift(self) -> float:
@@ -154,11 +137,6 @@ class SmoothChain:
     def log_determinant(self) -> float:
         """Log det of the covariance of the steps, but for what their length makes it."""
         return 2.0 * float(np.log(self.density).sum())
-
-    @property
-    def middle(self) -> float:
-        """Middle of the record, s."""
-        return 0.5 * float(self.node_time[0] + self.node_time[-1])
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
@@ -173,11 +151,6 @@ class SmoothChain:
             graph.addPriorVector(keys.rate(0), s.omega_b[0], rate)
             graph.addPriorVector(keys.node(0), np.append(s.p_n[0], s.v_n[0]), track)
         return graph
-
-    @property
-    def constants(self) -> dict[int, int]:
-        """Dimensions of the variables that all nodes share, by key: none."""
-        return {}
 
     @property
     def sizes(self) -> list[int]:
@@ -199,10 +172,6 @@ class SmoothChain:
         # Of all states, which take long to insert.
         vars(out)["zeros"] = self.zeros
         return out
-
-    def nodes_of(self, block: slice) -> range:
-        """Return the nodes from the first of some steps to that of the steps after them."""
-        return range(block.start, block.stop + (block.stop == self.count))
 
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
         """Return the keys of the attitudes of nodes, each with those of its rates and track."""
@@ -367,32 +336,6 @@ class SmoothChain:
                 axis=2,
             )
             yield StepRows(MOTION, _COMPONENTS, first, found.residual, by_nodes)
-
-    def add_prior(
-        self,
-        graph: gtsam.NonlinearFactorGraph,
-        parameters: Sequence[Parameter],
-        key_of: Mapping[str, int],
-        constants_prior: ConstantsPrior | None,
-    ) -> Sequence[Parameter]:
-        """Add nothing: it has no constants; return all parameters."""
-        return parameters
-
-    def mean_constants(
-        self, states: ChainStates
-    ) -> Iterator[tuple[Parameter, Array, dict[int, Array]]]:
-        """Yield nothing: it has no parameters of its own."""
-        yield from ()
-
-    def errors(self, parameters: Sequence[Parameter], key_of: Mapping[str, int]) -> None:
-        """Return None: there is no IMU."""
-
-    def release(self) -> None:
-        """Free nothing: nothing is kept for binding measurements."""
-
-    def sources(self, letters: str) -> dict[str, slice]:
-        """Return the sources of noise of one of its factors, and which rows each has."""
-        return {FIRST_STATE: slice(None)}
 
     def assumed(self) -> dict[str, str]:
         """Return what is assumed of each of these sources, as text."""
