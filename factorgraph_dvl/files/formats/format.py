@@ -51,6 +51,7 @@ Kind = Literal[
     "imu",
     "depth",
     "clock",
+    "transponder",
     "acoustic",
     "topside",
     "settings",
@@ -84,6 +85,15 @@ _PING = np.dtype(
         ("window", "f8"),
     ]
 )
+_FIX = np.dtype(
+    [
+        *_HEAD,
+        *((name, "f8") for name in ("lat", "lon", "height", "altitude", "quality")),
+        *((name, "f8", (3,)) for name in ("std", "velocity", "velocity_std")),
+    ]
+)
+# Kinds of records of positions: of an antenna, and of a transponder under water.
+FIXES: tuple[Kind, ...] = ("fix", "transponder")
 
 # Records by kind. Angles rad: roll starboard down, pitch bow up, heading clockwise from north.
 #
@@ -104,6 +114,8 @@ _PING = np.dtype(
 # ins_std   standard deviations of a navigation solution that has a file of its own.
 # imu       `gyro` rad/s and `accel` m/s² (specific force), in `Batch.axes`.
 # depth     `depth` m below the surface.
+# transponder
+#           the same of a transponder under water.
 # acoustic  `place` of the vehicle, forward, starboard, down of a vessel at the surface; `std`; m.
 # topside   `lat`, `lon` of that vessel and `quality` as in GGA; its true `heading`.
 # settings  what was set for the file that `Batch.stream` names, without a time: magnetic
@@ -113,13 +125,8 @@ _PING = np.dtype(
 KINDS: dict[Kind, np.dtype[Any]] = {
     "dvl": _PING,
     "water": _PING,
-    "fix": np.dtype(
-        [
-            *_HEAD,
-            *((name, "f8") for name in ("lat", "lon", "height", "altitude", "quality")),
-            *((name, "f8", (3,)) for name in ("std", "velocity", "velocity_std")),
-        ]
-    ),
+    "fix": _FIX,
+    "transponder": _FIX,
     "course": np.dtype([*_HEAD, ("speed", "f8"), ("course", "f8")]),
     "attitude": np.dtype([*_HEAD, *_RPH, ("std", "f8", (3,))]),
     "ins": np.dtype(
@@ -152,7 +159,11 @@ KINDS: dict[Kind, np.dtype[Any]] = {
 
 
 # The field without which a record of a kind says nothing.
-_VALUE: dict[Kind, str] = {"fix": "lat", "ins": "lat", "course": "speed", "depth": "depth"}
+_VALUE: dict[Kind, str] = {
+    **dict.fromkeys(("fix", "transponder", "ins"), "lat"),
+    "course": "speed",
+    "depth": "depth",
+}
 
 
 @dataclass(frozen=True)
@@ -281,7 +292,7 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
         valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
     elif (name := _VALUE.get(batch.kind)) is not None:
         valueless = np.isnan(records[name])
-        reason = NO_FIX if batch.kind == "fix" else NO_VALUE
+        reason = NO_FIX if batch.kind in FIXES else NO_VALUE
     return {NO_TIME: timeless, reason: valueless & ~timeless}
 
 

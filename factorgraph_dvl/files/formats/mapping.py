@@ -27,6 +27,7 @@ UNITS = {
 COORDINATES = {"beam": BEAM, "instrument": INSTRUMENT, "ship": SHIP, "earth": EARTH}
 
 _XYZ, _ENU, _RPH = ("x", "y", "z"), ("e", "n", "u"), ("roll", "pitch", "heading")
+_FRD = ("forward", "starboard", "down")
 _PING_FIELDS = {
     **{f"vel_{axis}": ("velocity", i, "m/s") for i, axis in enumerate(_XYZ)},
     **{f"std_{axis}": ("std", i, "m/s") for i, axis in enumerate(_XYZ)},
@@ -72,6 +73,21 @@ FIELDS: dict[Kind, dict[str, tuple[str, int | None, str]]] = {
         **{f"accel_{axis}": ("accel", i, "m/s2") for i, axis in enumerate(_XYZ)},
     },
     "depth": {"depth": ("depth", None, "m")},
+    "transponder": {
+        **_PLACE,
+        "altitude": ("altitude", None, "m"),
+        **{f"std_{axis}": ("std", i, "m") for i, axis in enumerate(_ENU)},
+    },
+    "acoustic": {
+        **{name: ("place", i, "m") for i, name in enumerate(_FRD)},
+        "std": ("std", None, "m"),
+    },
+    "topside": {
+        "lat": ("lat", None, "deg"),
+        "lon": ("lon", None, "deg"),
+        "quality": ("quality", None, "1"),
+        "heading": ("heading", None, "deg"),
+    },
 }
 _NEEDED: dict[Kind, tuple[tuple[str, ...], ...]] = {
     "dvl": (("vel_x", "vel_y", "vel_z"), ("beam1", "beam2", "beam3", "beam4")),
@@ -82,8 +98,24 @@ _NEEDED: dict[Kind, tuple[tuple[str, ...], ...]] = {
     "ins": (("lat", "lon", "height", "vel_e", "vel_n", "vel_u", *_RPH),),
     "imu": (tuple(f"{name}_{axis}" for name in ("gyro", "accel") for axis in _XYZ),),
     "depth": (("depth",),),
+    "transponder": (("lat", "lon"),),
+    "acoustic": (_FRD,),
+    "topside": (("lat", "lon"), ("heading",)),
 }
 
+TableKind = Literal[
+    "dvl",
+    "water",
+    "fix",
+    "course",
+    "attitude",
+    "ins",
+    "imu",
+    "depth",
+    "transponder",
+    "acoustic",
+    "topside",
+]
 ColumnName = str | int
 Sign = Literal[1, -1]
 
@@ -145,7 +177,7 @@ class TableMapping(Section, frozen=True, kw_only=True):
 
     file: str = "*"
     topic: str = ""
-    kind: Literal["dvl", "water", "fix", "course", "attitude", "ins", "imu", "depth"]
+    kind: TableKind
     time: TimeColumn
     columns: dict[str, Column | str | int]
     separator: Literal[",", ";", "tab", "space"] | None = None

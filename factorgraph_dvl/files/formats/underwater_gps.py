@@ -101,14 +101,14 @@ def _surface(found: list[Row], at: Array, losses: Losses) -> Iterator[Batch]:
     is_vessel = (heading >= 0.0) & (heading <= 360.0)
     vessel = _begun(empty("topside", len(found)), found, at)
     vessel["heading"] = heading * DEG
-    fix = _begun(empty("fix", len(found)), found, at)
+    fix = _begun(empty("transponder", len(found)), found, at)
     for out in (vessel, fix):
         out["lat"], out["lon"] = _column(found, "lat") * DEG, _column(found, "lon") * DEG
         out["quality"] = _column(found, "fix_quality")
     if is_vessel.any():
         yield Batch("topside", vessel[is_vessel], "own", "position", notes=(_SURFACE_NOTE,))
     if not is_vessel.all():
-        yield Batch("fix", fix[~is_vessel], "own", "position", notes=(_GLOBAL_NOTE,))
+        yield Batch("transponder", fix[~is_vessel], "own", "position", notes=(_GLOBAL_NOTE,))
 
 
 def _gga(found: list[Row], at: Array, losses: Losses) -> Iterator[Batch]:

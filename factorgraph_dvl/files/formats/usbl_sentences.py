@@ -97,7 +97,7 @@ def _absolute(fields: list[bytes], losses: Losses) -> tuple[_Key, tuple[float, .
         losses.skip("PTSAG", NO_FIX)
         return None
     beacon = fields[5].lstrip(b"0") or _SHIP
-    kind: Kind = "topside" if beacon == _SHIP else "fix"
+    kind: Kind = "topside" if beacon == _SHIP else "transponder"
     time = float(posix(*(int(part) for part in date))[0]) + _of_day(fields[1])
     stream = f"PTSAG {beacon.decode('latin-1')}"
     # Without a depth, 9999 or a validity of 0.
@@ -128,9 +128,9 @@ def _batches(rows: Mapping[_Key, list[tuple[float, ...]]]) -> Iterator[Batch]:
             yield Batch(kind, out, clock, stream, notes=(_HEAD_UP,))
             continue
         out["lat"], out["lon"] = values[:2]
-        if kind == "fix":
+        if kind == "transponder":
             out["altitude"] = -values[2]
-        yield Batch(kind, out, clock, stream, notes=(_DEPTH,) if kind == "fix" else ())
+        yield Batch(kind, out, clock, stream, notes=(_DEPTH,) if kind == "transponder" else ())
 
 
 FORMAT = Format(

@@ -18,10 +18,8 @@ from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 
-# Formats whose fixes are of a transponder under water.
-UNDER_WATER = ("underwater-gps", "usbl-sentences")
-# Those of them beside whose places sentences of GNSS and compass are the vessel's.
-_BESIDE_SENTENCES = "usbl-sentences"
+# Formats beside whose places sentences of GNSS and compass are the vessel's.
+_BESIDE_SENTENCES = ("usbl-sentences", "table")
 _SENTENCES = "nmea"
 # Chosen: of a true heading by GNSS or a gyrocompass that states none.
 _HEADING_STD = 1.0 * DEG
@@ -82,10 +80,10 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
             stated.append(fixes["std"][:, 0])
             yield fixes
 
-    records = spool.store(parts(), KINDS["fix"])
+    records = spool.store(parts(), KINDS["transponder"])
     _judge(places.label, np.concatenate(changes), np.concatenate(stated), decisions)
     stream = Stream(
-        first.file, first.format, "fix", "utc", first.stream, "", "unknown", (), records
+        first.file, first.format, "transponder", "utc", first.stream, "", "unknown", (), records
     )
     return [*others, Timed.of(stream, times, spool)]
 
@@ -121,7 +119,7 @@ def _judge(label: str, changes: Array, stated: Array, decisions: Decisions) -> N
 def _with_vessel(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
     """Return streams with fixes and headings beside places of a USBL as those of the vessel."""
     if not any(
-        t.stream.format == _BESIDE_SENTENCES and t.stream.kind == "acoustic" for t in streams
+        t.stream.format in _BESIDE_SENTENCES and t.stream.kind == "acoustic" for t in streams
     ):
         return list(streams)
     out = []
@@ -151,7 +149,7 @@ def _of_one_transponder(streams: Sequence[Timed], decisions: Decisions) -> list[
     under = [
         t
         for t in streams
-        if t.stream.format == _BESIDE_SENTENCES and t.stream.kind in ("acoustic", "fix")
+        if t.stream.format in _BESIDE_SENTENCES and t.stream.kind in ("acoustic", "transponder")
     ]
     names = {t.stream.stream for t in under}
     if len(names) < 2:
@@ -177,7 +175,7 @@ def _fullest(streams: Sequence[Timed], name: str, decisions: Decisions) -> Merge
 
 def _fixes(places: Merged, position: Beside, heading: Beside) -> Iterator[tuple[Array, Records]]:
     for time, part in places.chunks():
-        out = empty("fix", len(part))
+        out = empty("transponder", len(part))
         for name in ("at", "received"):
             out[name] = part[name]
         out["time"] = time

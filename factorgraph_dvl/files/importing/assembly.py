@@ -13,7 +13,6 @@ import numpy as np
 from factorgraph_dvl.files.formats.format import empty
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing import motion, orientation, positions, velocity
-from factorgraph_dvl.files.importing.acoustic import UNDER_WATER
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import Merged
 from factorgraph_dvl.files.importing.time_base import FIRST_DATE, Timed
@@ -109,7 +108,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
             "imu.grade",
         )
     if gnss is not None:
-        under_water = gnss.fixes.streams[0].stream.format in UNDER_WATER
+        under_water = gnss.fixes.streams[0].stream.kind == "transponder"
         add = _add_usbl if under_water else _add_gnss
         add(out, gnss, imu is not None or ins is not None)
     if ins is not None:

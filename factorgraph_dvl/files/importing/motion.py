@@ -23,7 +23,7 @@ _STDS = ("std", "velocity_std", "attitude_std")
 
 def choose(streams: Sequence[Timed], kind: str, decisions: Decisions) -> Merged | None:
     """Return the records of a kind from its fullest source in all files, None without."""
-    return merge(best_source(streams, kind, _count, decisions), decisions)
+    return merge(best_source(streams, (kind,), _count, decisions), decisions)
 
 
 def choose_imu(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:

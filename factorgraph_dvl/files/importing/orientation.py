@@ -91,7 +91,7 @@ def choose(
         Takes what was chosen, and why.
     """
     known = [t for t in streams if t.stream.kind != "attitude" or _has_heading(t)]
-    attitude = merge(best_source(known, "attitude", _rank, decisions), decisions)
+    attitude = merge(best_source(known, ("attitude",), _rank, decisions), decisions)
     if attitude is None:
         return None
     stream = attitude.streams[0].stream

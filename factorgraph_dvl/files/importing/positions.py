@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.format import FIXES
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import SAMPLE, Beside, Merged, merge
@@ -121,22 +122,22 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Positions | None:
     decisions : Decisions
         Takes what was chosen, and why.
     """
-    fixes = merge(best_source(streams, "fix", _rank_of_fixes, decisions), decisions)
+    fixes = merge(best_source(streams, FIXES, _rank_of_fixes, decisions), decisions)
     if fixes is None:
         return None
-    courses = merge(best_source(streams, "course", _count, decisions), decisions)
+    courses = merge(best_source(streams, ("course",), _count, decisions), decisions)
     height = _height(fixes, decisions)
     _describe(fixes, courses, decisions)
     return Positions(fixes, courses, height)
 
 
 def best_source(
-    streams: Sequence[Timed], kind: str, rank: object, decisions: Decisions
+    streams: Sequence[Timed], kinds: Sequence[str], rank: object, decisions: Decisions
 ) -> list[Timed]:
-    """Return the streams of the best source of a kind, from all files."""
+    """Return the streams of the best source of some kinds, from all files."""
     sources: dict[tuple[str, str], list[Timed]] = {}
     for timed in streams:
-        if timed.stream.kind == kind:
+        if timed.stream.kind in kinds:
             sources.setdefault((timed.stream.format, timed.stream.stream), []).append(timed)
     if not sources:
         return []
@@ -144,7 +145,7 @@ def best_source(
     for other in ordered[1:]:
         decisions.add(
             ", ".join(dict.fromkeys(timed.stream.label for timed in other)),
-            f"{kind} not used: {ordered[0][0].stream.label} is better",
+            f"{kinds[0]} not used: {ordered[0][0].stream.label} is better",
         )
     return ordered[0]
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from factorgraph_dvl.files.formats.format import FIXES
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.formats.janus import from_beams
 from factorgraph_dvl.files.formats.velocities import BEAM
@@ -47,7 +48,7 @@ def log_speed(streams: Sequence[Stream]) -> Series | None:
 
 
 def _over_ground(stream: Stream, times: Stored) -> Iterator[Series]:
-    if stream.kind not in ("course", "fix", "ins"):
+    if stream.kind not in ("course", "ins", *FIXES):
         return
     last, last_time = stream.records[:0], np.empty(0)
     for part, time in zip(stream.records.chunks(), times.chunks(), strict=True):

@@ -9,6 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.clocks import GPS_EPOCH, gps_to_utc, in_order, nearest_day
+from factorgraph_dvl.files.formats.format import FIXES
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.lag import lag_between
 from factorgraph_dvl.files.importing.speeds import ground_speed, log_speed
@@ -192,7 +193,7 @@ def _pairs(
     """Return recording clock and UTC of the same instants."""
     received, utc = [np.empty(0)], [np.empty(0)]
     for stream in streams:
-        if stream.clock != "utc" or stream.kind not in ("fix", "clock"):
+        if stream.clock != "utc" or stream.kind not in (*FIXES, "clock"):
             continue
         part, times = (x.thinned(_MOST_PAIRS) for x in (stream.records, dated[id(stream)].time))
         if stream.file == file:

@@ -127,7 +127,7 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Velocities | None:
     _check_one_instrument(streams)
     usable = _usable(streams, decisions)
     for kind, reference in (("dvl", "bottom"), ("water", "water")):
-        pings = merge(best_source(usable, kind, _lock, decisions), decisions)
+        pings = merge(best_source(usable, (kind,), _lock, decisions), decisions)
         if pings is None:
             continue
         locked = sum(int(np.isfinite(speed_of(part)).sum()) for _, part in pings.chunks())

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.files.formats.mapping import MappingSettings
 from factorgraph_dvl.files.importing.raw_files import import_files
 from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.geometry.earth import radii
 from factorgraph_dvl.sensors.usbl import Usbl, UsblSettings
+from factorgraph_dvl.settings.yaml_file import read_yaml
 
 DEG = np.pi / 180.0
 
@@ -104,6 +106,58 @@ def test_sentences_of_a_usbl_beside_those_of_the_ship(tmp_path):
     np.testing.assert_allclose(height, -30.0)
     assert lat.size == 20
     assert "other transponders left out: PSIMSSB B02 (5)" in decisions.text("")
+
+
+def table(tmp_path, name, header, *columns):
+    values = np.column_stack([np.arange(20.0), *(np.full(20, c) for c in columns)])
+    np.savetxt(tmp_path / name, values, delimiter=",", header=f"t,{header}", comments="")
+    return tmp_path / name
+
+
+def test_tables_of_a_usbl_need_a_mapping_only(tmp_path):
+    """Places relative to a ship with the bow to the east, and the ship's own positions."""
+    paths = [
+        table(tmp_path, "usbl.csv", "x,y,z,s", 10.0, -5.0, -30.0, 1.5),
+        table(tmp_path, "ship.csv", "lat,lon,hdg", 54.0, -3.0, 90.0),
+    ]
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("""tables:
+  - file: usbl.csv
+    kind: acoustic
+    time: {column: t}
+    columns: {forward: x, starboard: {column: y, sign: -1}, down: {column: z, sign: -1}, std: s}
+  - file: ship.csv
+    kind: topside
+    time: {column: t}
+    columns: {lat: lat, lon: lon, heading: hdg}
+""")
+    import_files(paths, tmp_path / "trial", mapping=read_yaml(mapping, MappingSettings))
+    lat, lon, height = columns(
+        tmp_path / "trial" / "usbl.parquet", "lat_deg", "lon_deg", "height_m"
+    )
+    meridian, transverse = radii(54.0 * DEG)
+    np.testing.assert_allclose((lat - 54.0) * DEG * meridian, -5.0, atol=1e-3)
+    east = (lon + 3.0) * DEG * transverse * np.cos(54.0 * DEG)
+    np.testing.assert_allclose(east, 10.0, atol=1e-3)
+    np.testing.assert_allclose(height, -30.0)
+
+
+def test_a_table_of_fixes_under_water_is_that_of_a_usbl(tmp_path):
+    path = table(tmp_path, "rov.csv", "lat,lon,depth,s", 54.0, -3.0, 30.0, 0.7)
+    mapping = tmp_path / "map.yaml"
+    mapping.write_text("""tables:
+  - kind: transponder
+    time: {column: t}
+    columns: {lat: lat, lon: lon, altitude: {column: depth, sign: -1}, std_e: s, std_n: s}
+""")
+    import_files([path], tmp_path / "trial", mapping=read_yaml(mapping, MappingSettings))
+    lat, height, std = columns(
+        tmp_path / "trial" / "usbl.parquet", "lat_deg", "height_m", "std_n_m"
+    )
+    np.testing.assert_allclose(lat, 54.0)
+    np.testing.assert_allclose(height, -30.0)
+    np.testing.assert_allclose(std, 0.7)
+    assert not (tmp_path / "trial" / "gnss.parquet").exists()
 
 
 def test_positions_by_the_example_of_the_document(tmp_path):
