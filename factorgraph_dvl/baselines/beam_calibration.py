@@ -16,10 +16,10 @@ from factorgraph_dvl.baselines.beam_filter import (
 from factorgraph_dvl.baselines.navigation import attitude_is_known, motion_at, navigate
 from factorgraph_dvl.baselines.outcome import Outcome
 from factorgraph_dvl.baselines.summary import (
-    WHITE_NOISE,
     left_out,
     sensor_motion,
     summarise,
+    treated_as_white,
 )
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.estimates import Residuals, Trajectory
@@ -78,7 +78,7 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))
     residual, sigma = beam_residuals(pings, outcome.estimated)
     components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
-    findings = [*navigation.findings, WHITE_NOISE]
+    findings = [*navigation.findings, treated_as_white()]
     findings += left_out(sensor, int(np.sum(received & ~covered)), int(np.sum(covered & ~used)))
     solution = summarise(
         trial,

@@ -1,4 +1,4 @@
-"""The two point sets of a calibration, and their residuals."""
+"""The two point sets of a calibration, their residuals and the derivatives of these."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.rotations import (
     exp_so3,
 )
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, cross_variance, rotate
+from factorgraph_dvl.geometry.vectors import Array, cross_variance, rotate, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
 # Chosen: prior standard deviation beyond which a misalignment may be anything.
@@ -114,6 +114,31 @@ def residuals(points: Points, estimated: Estimated, lever_arm: Array) -> tuple[A
     residual = scale * rotate(dRb[None], points.at_dvl(arm)) + bias - points.v_d
     P = points.covariance_d(dRb, arm)
     return residual, np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+
+
+def derivatives(points: Points, estimated: Estimated, lever_arm: Array) -> Array:
+    """Return the derivatives of `residuals` by what was estimated, (M, 3, n).
+
+    Those by other parameters than these five, and by a time offset, are zero.
+    """
+    dRb = estimated.value("misalignment", np.eye(3))
+    scale = 1.0 + estimated.value("scale_error", np.zeros(1))
+    M = np.broadcast_to(scale, 3)[:, None] * dRb
+    at_dvl = points.at_dvl(estimated.value("lever_arm", lever_arm))
+    by_scale = (at_dvl @ dRb.T)[:, :, None]
+    columns = {
+        "misalignment": -M @ skew(at_dvl),
+        "scale_error": by_scale if scale.size == 1 else by_scale * np.eye(3),
+        "lever_arm": M @ skew(points.omega_b),
+        "dvl_bias": np.broadcast_to(np.eye(3), (len(points), 3, 3)),
+    }
+    return np.concatenate(
+        [
+            columns.get(p.stem, np.zeros((len(points), 3, p.mean.size)))
+            for p in estimated.parameters
+        ],
+        axis=2,
+    )
 
 
 PointsAt = Callable[[float], Points]

@@ -1,11 +1,12 @@
-"""Covariance of a fit that has none of its own: from the scatter of its residuals."""
+"""Covariance of a fit that has none of its own, and what other methods leave out of theirs."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from factorgraph_dvl.baselines.navigation import NavigationMotion
 from factorgraph_dvl.baselines.outcome import Estimated
-from factorgraph_dvl.baselines.point_sets import Points
+from factorgraph_dvl.baselines.point_sets import Points, derivatives, residuals
 from factorgraph_dvl.geometry.vectors import Array, skew
 from factorgraph_dvl.sensors.parameters import Parameter
 
@@ -36,20 +37,48 @@ def by_residuals(
         Where it was not fitted.
     """
     found = Estimated(parameters, values, np.zeros((0, 0)))
-    dRb = found.value("misalignment", np.eye(3))
-    k = 1.0 + float(found.value("scale_error", np.zeros(1))[0])
-    at_dvl = points.at_dvl(found.value("lever_arm", lever_arm))
     weight = point_weights(points)
-    columns = {
-        "misalignment": -k * dRb @ skew(at_dvl),
-        "scale_error": (at_dvl @ dRb.T)[:, :, None],
-        "lever_arm": k * dRb @ skew(points.omega_b),
-    }
-    H = np.concatenate([columns[p.stem] for p in parameters], axis=2)
-    residual = k * at_dvl @ dRb.T - points.v_d
+    H = derivatives(points, found, lever_arm)
+    residual, _ = residuals(points, found, lever_arm)
     freedom = max(3 * len(points) - H.shape[2], 1)
     unit = max(float(weight @ np.sum(residual**2, axis=1)) / freedom, 1e-12)
     information = np.einsum("mij,m,mik->jk", H, weight, H, optimize=True) / unit
     sigma = np.maximum(np.concatenate([p.sigma for p in parameters]), 1e-9)
     covariance = np.linalg.inv(information + np.diag(1.0 / sigma**2))
     return Estimated(parameters, values, covariance)
+
+
+def neglected_by(
+    points: Points, motion: NavigationMotion, estimated: Estimated, lever_arm: Array
+) -> Array:
+    """Return by how much too small standard deviations may be, (n,), as factors.
+
+    The methods take the error of the attitude to compare with as new at every ping. At the other
+    end it lasts for the whole trial, e(t) = L(t) x with x of unit variance. With H the
+    derivatives of the residuals, R their covariance, J those by e, and P the covariance of the
+    method, the variance is then that of P (1 + b bᵀ P), with b = Σ Hᵀ R⁻¹ J L.
+
+    Parameters
+    ----------
+    points : Points
+        The two point sets.
+    motion : NavigationMotion
+        What the attitudes of body are, at the same pings.
+    estimated : Estimated
+        Found, with its covariance.
+    lever_arm : ndarray, shape (3,), m
+        Where it was not estimated.
+    """
+    dRb = estimated.value("misalignment", np.eye(3))
+    scale = 1.0 + estimated.value("scale_error", np.zeros(1))
+    H = derivatives(points, estimated, lever_arm)
+    size, axes = np.linalg.eigh(motion.covariance[:, 6:9, 6:9])
+    L = axes @ (np.sqrt(np.maximum(size, 0.0))[:, :, None] * axes.transpose(0, 2, 1))
+    by_attitude = dRb @ motion.nRb.transpose(0, 2, 1) @ skew(motion.velocity)
+    JL = scale[:, None] * (by_attitude @ L)
+    R = points.covariance_d(dRb, estimated.value("lever_arm", lever_arm))
+    b = np.einsum("mip,mij->pj", H, np.linalg.solve(R, JL))
+    P = estimated.covariance
+    variance = np.diagonal(P)
+    more = np.sum((P @ b) ** 2, axis=1)
+    return np.sqrt(1.0 + np.divide(more, variance, out=np.zeros_like(more), where=variance > 0.0))

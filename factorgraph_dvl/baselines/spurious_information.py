@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from factorgraph_dvl.baselines.outcome import Estimated
-from factorgraph_dvl.baselines.point_sets import Points
+from factorgraph_dvl.baselines.point_sets import Points, derivatives
 from factorgraph_dvl.estimates import OBSERVABLE
 from factorgraph_dvl.geometry.vectors import Array, skew
 
@@ -40,34 +40,24 @@ def without_spurious_information(
     scale = 1.0 + estimated.value("scale_error", np.zeros(1))
     arm = estimated.value("lever_arm", lever_arm)
     M = np.broadcast_to(scale, 3)[:, None] * dRb
-    u = points.at_dvl(arm)
-    turned = u @ dRb.T
     P = points.v_b_covariance
     S = points.omega_sigma[:, :, None] ** 2 * np.eye(3)
     weight = np.linalg.inv(points.covariance_d(dRb, arm))
     inner = M.T @ weight @ M
 
-    blocks: list[Array] = []
     noises: list[Array] = []
     for p in estimated.parameters:
         n = p.mean.size
         if p.stem == "misalignment":
-            blocks.append(-M @ skew(u))
             noises.append(_crossed(P, inner))
         elif p.stem == "scale_error":
             power = np.sum(weight * (dRb @ P @ dRb.T), axis=0)
-            blocks.append(turned[:, :, None] * (np.ones((3, 1)) if n == 1 else np.eye(3)))
             noises.append(power.sum().reshape(1, 1) if n == 1 else power)
         elif p.stem == "lever_arm":
-            blocks.append(M @ skew(points.omega_b))
             noises.append(_crossed(S, inner))
-        elif p.stem == "dvl_bias":
-            blocks.append(np.broadcast_to(np.eye(3), (len(points), 3, 3)))
-            noises.append(np.zeros((3, 3)))
         else:
-            blocks.append(np.zeros((len(points), 3, n)))
             noises.append(np.zeros((n, n)))
-    H = np.concatenate(blocks, axis=2)
+    H = derivatives(points, estimated, lever_arm)
     information = np.sum(H.transpose(0, 2, 1) @ weight @ H, axis=0)
     noise, at = np.zeros_like(information), 0
     for block in noises:

@@ -19,6 +19,7 @@ from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import (
+    TOO_LARGE,
     consistency_findings,
     contradictions,
     not_observable,
@@ -30,10 +31,24 @@ from factorgraph_dvl.sensors.protocol import Motion as SensorMotion
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
-WHITE_NOISE = Finding(
-    Code.METHOD_LIMITS,
-    message("method_limits.white_noise"),
-)
+
+def treated_as_white(names: Sequence[str] = (), factors: Array | None = None) -> Finding:
+    """Say that errors of the motion count as white noise, and what that may do to deviations.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Components (n,) of the calibration.
+    factors : ndarray, shape (n,), optional
+        Factors by which their standard deviations may be too small.
+    """
+    if factors is None or factors.max(initial=1.0) <= TOO_LARGE:
+        return Finding(Code.METHOD_LIMITS, message("method_limits.white_noise"))
+    worst = int(np.argmax(factors))
+    text = message(
+        "method_limits.lasting_attitude", name=names[worst], factor=float(factors[worst])
+    )
+    return Finding(Code.METHOD_LIMITS, text, severity="warning")
 
 
 def summarise(
