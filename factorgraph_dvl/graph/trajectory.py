@@ -19,6 +19,7 @@ from factorgraph_dvl.geometry.rotations import (
     rph_jacobian,
 )
 from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
+from factorgraph_dvl.graph.chain import ChainStates
 from factorgraph_dvl.imu.preintegration import Segments
 from factorgraph_dvl.imu.propagation import (
     Attachment,
@@ -220,7 +221,7 @@ def between(P_n: Array, node: IntArray, fraction: Array) -> Array:
 
 
 def reported(
-    time: Array, motion: Motion, P_n: Array, frame: LocalFrame, body_axes: BodyAxes
+    time: Array, motion: ChainStates, P_n: Array, frame: LocalFrame, body_axes: BodyAxes
 ) -> Trajectory:
     """Return a motion with its covariances in the frames of a trajectory."""
     lat, lon, height = frame.geodetic(motion.p_n)

@@ -12,8 +12,8 @@ import numpy as np
 
 from factorgraph_dvl.estimates import Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation, rph_jacobian
-from factorgraph_dvl.geometry.vectors import Array, IntArray, rotate
+from factorgraph_dvl.geometry.rotations import BodyAxes
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.inertial_chain import InertialChain
@@ -31,7 +31,9 @@ from factorgraph_dvl.graph.trajectory import (
     Epochs,
     attached_epochs,
     epochs_between,
+    reported,
     successive,
+    tangent_in_n,
     trajectory_at,
 )
 from factorgraph_dvl.imu.preintegration import Segments
@@ -313,8 +315,13 @@ class Navigator:
     def newest(self, body_axes: BodyAxes) -> Callable[[], Trajectory]:
         """Return what computes the newest state as known now, as a trajectory of one epoch."""
         k, P = self.smoother.node, self._P[:STATE_SIZE, :STATE_SIZE]
-        known = self.smoother.state(k), self.smoother.bias(k)
-        return partial(_as_trajectory, *known, P, self.time, self.start.frame, body_axes)
+        states, time = self.smoother.states([k]), np.array([self.time])
+
+        def state() -> Trajectory:
+            P_n = tangent_in_n(P[None], states.nRb)
+            return reported(time, states, P_n, self.start.frame, body_axes)
+
+        return state
 
     def smoothed(self, first: int, last: int, body_axes: BodyAxes) -> Trajectory:
         """Return the motion from state `first` to state `last`, smoothed with later data."""
@@ -492,33 +499,3 @@ class Navigator:
             for p in self.start.parameters
         ]
         return np.concatenate(parts)
-
-
-def _as_trajectory(
-    state: gtsam.NavState,
-    bias: gtsam.imuBias.ConstantBias,
-    P: Array,
-    time: float,
-    frame: LocalFrame,
-    body_axes: BodyAxes,
-) -> Trajectory:
-    """Return a state with its covariance (9, 9), in GTSAM's tangent space, at a time, s."""
-    states = states_of([state], [bias])
-    lat, lon, height = frame.geodetic(states.p_n)
-    lRn = frame.level_from_tangent(lat, lon)
-    lRb = lRn @ states.nRb
-    rph = rph_from_rotation(lRb, body_axes)
-    to_rph = rph_jacobian(rph, body_axes)
-
-    def covariance(i: int, jacobian: Array) -> Array:
-        return jacobian @ P[i : i + 3, i : i + 3] @ jacobian.transpose(0, 2, 1)
-
-    return Trajectory(
-        time=np.array([time]),
-        geodetic=np.stack([lat, lon, height], axis=1),
-        velocity=rotate(lRn, states.v_n),
-        rph=rph,
-        position_cov=covariance(3, lRb),
-        velocity_cov=covariance(6, lRb),
-        rph_cov=covariance(0, to_rph),
-    )

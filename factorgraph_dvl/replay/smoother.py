@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from scipy.linalg.lapack import dtrtri
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.imu.propagation import States
@@ -95,8 +95,6 @@ class Smoother:
             self._state_step[3:6] = _POSITION_STEP_BY_RANGES
         settings = _settings(self.parameters, self._state_step, errors, fixed=lag is not None)
         self._isam = gtsam.ISAM2(settings)
-        # By state, what `_all_rows` has; it lasts until an old state is touched.
-        self._rows: dict[int, Array] = {}
         self._sizes = {key: int(size) for key, size in values.dims().items()}
         self._update(prior, values, node)
 
@@ -134,7 +132,6 @@ class Smoother:
 
     def correct(self, factors: gtsam.NonlinearFactorGraph, first: int) -> None:
         """Add measurements of states that are there, the oldest of index `first`."""
-        self._rows.clear()
         self._update(factors, gtsam.Values(), first)
 
     def state(self, k: int) -> gtsam.NavState:
@@ -183,11 +180,7 @@ class Smoother:
         In that order, in GTSAM's tangent space, SI: attitude, position, velocity, bias of
         accelerometer and gyro, parameters, correlated errors.
         """
-        return self._covariance_of(self._top())
-
-    def _covariance_of(self, wanted: Sequence[int]) -> Array:
-        """Return the joint covariance of variables of `_solve_newest`, in their order."""
-        own = np.concatenate([self._inverse[self._place[key]] for key in wanted])
+        own = np.concatenate([self._inverse[self._place[key]] for key in self._top()])
         return np.asarray(own @ own.T)
 
     def _solve_newest(self) -> None:
@@ -208,11 +201,6 @@ class Smoother:
         # Of the newest, which are asked for again and again.
         self._states: dict[int, gtsam.NavState] = {}
         self._biases: dict[int, gtsam.imuBias.ConstantBias] = {}
-        if before and order[: len(before)] == before:
-            later = [*self._of_state(self.node), *self._shared()]
-            own = self._place[before[-1]].stop
-            parts = [R[:own, self._place[key]] for key in later]
-            self._rows[self.node - 1] = np.concatenate([R[:own, :own], *parts], axis=1)
 
     def states(self, wanted: Sequence[int]) -> States:
         """Return the estimates of states, by their indices, with the biases there."""
@@ -230,74 +218,8 @@ class Smoother:
         )
 
     def state_covariances(self, wanted: Sequence[int]) -> Array:
-        """Return covariances (K, 9, 9) of states, by their indices, given all that came since.
-
-        From the newest state back: given the next one and what all states share, each is
-
-            x = G (next, shared) + noise,    G = -R⁻¹ T,    with covariance R⁻¹ R⁻ᵀ,
-
-        for the rows [R T] of the square root of the information.
-        """
-        if len(self._rows) < len(self.times) - 1:
-            self._rows = dict(zip(self.times, self._all_rows(), strict=False))
-        nodes, rows = list(self.times), np.array(list(self._rows.values()))
-        top = [*self._of_state(self.node), *self._shared()]
-        own = rows.shape[1]
-        P = self._covariance_of(top)
-        inverse = np.linalg.inv(rows[:, :, :own])
-        gain = -inverse @ rows[:, :, own:]
-        noise = inverse @ inverse.transpose(0, 2, 1)
-        # Given what all share, the newest state is `shared` times that, with covariance `alone`.
-        shared = np.empty((len(nodes), own, len(P) - own))
-        alone = np.empty((len(nodes), own, own))
-        shared[-1] = np.linalg.solve(P[own:, own:], P[own:, :own]).T
-        alone[-1] = P[:own, :own] - shared[-1] @ P[own:, :own]
-        for j in range(len(rows) - 1, nodes.index(min(wanted)) - 1, -1):
-            by_next = gain[j, :, :own]
-            shared[j] = by_next @ shared[j + 1] + gain[j, :, own:]
-            alone[j] = by_next @ alone[j + 1] @ by_next.T + noise[j]
-        index = [nodes.index(k) for k in wanted]
-        across = shared[index, :STATE_SIZE]
-        found = alone[index, :STATE_SIZE, :STATE_SIZE]
-        found = found + across @ P[own:, own:] @ across.transpose(0, 2, 1)
-        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
-
-    def _all_rows(self) -> Array:
-        """Return rows [R T] (K - 1, own, 2 own + shared) of all states but the newest."""
-        net = self._isam.jointBayesNet(self._in_time(), gtsam.EliminateQR)
-        nodes = list(self.times)
-        size, shared = self._sizes, self._shared()
-        own = sum(size[key] for key in self._of_state(self.node))
-        rows = np.zeros((len(nodes) - 1, own, 2 * own + sum(size[key] for key in shared)))
-        # Column of each variable in its own rows; that of the next state is by `own` further.
-        column, at = {}, own
-        for key in [*self._of_state(self.node), *shared]:
-            column[key] = at
-            at += size[key]
-        number = {}
-        for j, k in enumerate(nodes):
-            offset = 0
-            for key in self._of_state(k):
-                number[key], column[key] = j, offset
-                offset += size[key]
-        # Conditionals that depend on the same variables, relative to their own, come in runs.
-        columns: dict[tuple[int, ...], IntArray] = {}
-        for i in range(len(rows) * len(self._of_state(self.node))):
-            conditional = net.at(i)
-            first, *others = conditional.keys()
-            j, start = number[first], column[first]
-            pattern = (start, *[key - first if key in number else key for key in others])
-            if pattern not in columns:
-                columns[pattern] = np.concatenate(
-                    [
-                        column[key] + own * (number.get(key, j) - j) + np.arange(size[key])
-                        for key in others
-                    ]
-                )
-            own_rows = rows[j, start : start + size[first]]
-            own_rows[:, start : start + size[first]] = conditional.R()
-            own_rows[:, columns[pattern]] = conditional.S()
-        return rows
+        """Return covariances (K, 9, 9) of states, by their indices, given all that came since."""
+        return np.array([self._isam.marginalCovariance(keys.node(k)) for k in wanted])
 
     def _top(self) -> list[int]:
         errors = [keys.correlated(self.node)] if self._errors else []
@@ -313,13 +235,10 @@ class Smoother:
             out.append(keys.correlated(k))
         return out
 
-    def _shared(self) -> list[int]:
-        """Return the keys of what all states share."""
-        return [*([] if self._walking else [keys.bias(0)]), *self.calibration_keys.values()]
-
     def _in_time(self) -> list[int]:
         """Return all keys in the order of elimination."""
-        return [*(key for k in self.times for key in self._of_state(k)), *self._shared()]
+        shared = [*([] if self._walking else [keys.bias(0)]), *self.calibration_keys.values()]
+        return [*(key for k in self.times for key in self._of_state(k)), *shared]
 
     def _update(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, first: int
@@ -327,7 +246,6 @@ class Smoother:
         settings = gtsam.ISAM2UpdateParams()
         if self._lag is None:
             settings.constrainedKeys = _groups([(key, 1) for key in self._top()])
-            self._rows.clear()
             self._isam.update(factors, values, settings)
             self._solve_newest()
             return
@@ -335,7 +253,6 @@ class Smoother:
         if moved is not None:
             first = min(first, moved)
             settings.force_relinearize = True
-            self._rows.clear()
         # What is touched, and all above it in the tree, is eliminated anew: in the order of
         # time, so that the oldest state stays a leaf. Groups beyond the number of variables
         # are not allowed; calibration and bias are in one.
@@ -378,7 +295,6 @@ class Smoother:
             del self._sizes[key]
         self._isam.marginalizeLeaves(leaves)
         del self.times[k]
-        self._rows.pop(k, None)
 
 
 def _settings(
