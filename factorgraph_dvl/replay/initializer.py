@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
-from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.replay.history import InertialHistory, RecordHistory
 from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.navigator_without_imu import (
+    NavigatorWithoutImu,
+    StartWithoutImu,
+    solve_start_without_imu,
+)
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
-from factorgraph_dvl.sensors.protocol import Aid
-from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.trial import InitialPosition, Trial
 
-# What rounding may take off a time, s: the sample at which a segment ended belongs to it.
-_ROUNDING = 1e-6
-# Data before the first attempt to start, s; chosen: in-motion alignment needs some turns or sway.
-_FIRST = 30.0
+# Data before the first attempt to start, s; chosen: in-motion alignment needs some turns or sway,
+# and without IMU some legs show the noise of fixes and pings.
+_FIRST, _FIRST_WITHOUT_IMU = 30.0, 60.0
 # The same after a gap of the IMU, s; chosen: biases and calibration are known by then.
 _AFTER_GAP = 10.0
 # Growth of the time since the start until the next attempt, and until the next batch solution of a
@@ -44,151 +43,13 @@ _ACCELERATION = 1.0
 _SWAY = 0.5
 # Span of data that is kept for a start, s; chosen: 30 minutes at 100 Hz are 10 MB.
 _LONGEST = 1800.0
-# Agreement of smoother and batch solution, in standard deviations, and standard deviation of
-# rotations, rad, from which on linearising once is enough; chosen. Measured: final estimates are
-# then within 0.1 standard deviations of those of a batch solution.
-_AGREEMENT = 0.1
-_SETTLED_ROTATION = np.radians(0.2)
 # Change of a rotation since it was linearised that asks for a new batch solution, rad; chosen:
 # second-order terms are then 5e-5 of a velocity.
 _ROTATION_CHANGE = 0.01
 
 
-class RecordHistory:
-    """Records that grow, and lose what is too old.
-
-    Parameters
-    ----------
-    settings : Trial
-        Trial of which all but the records counts.
-    longest : float
-        Span of data that is kept, s.
-    before : float, default 1.0
-        Span before the first IMU sample from which measurements are kept, s.
-    calibrated : sequence of str, optional
-        Sections of sensors that have reported before, and whose calibration is known.
-    """
-
-    def __init__(
-        self,
-        settings: Trial,
-        longest: float,
-        before: float = 1.0,
-        calibrated: Sequence[str] = (),
-    ) -> None:
-        self._settings = settings
-        self._longest = longest
-        self._before = before
-        self._calibrated = calibrated
-        self._samples: list[Array] = []
-        self._aids: dict[str, list[Aid]] = {}
-        self._rejected: dict[str, list[Array]] = {}
-
-    @property
-    def start(self) -> float:
-        """Time of the first sample, s; infinite if there is none."""
-        return float(self._samples[0][0, 0]) if self._samples else np.inf
-
-    @property
-    def empty(self) -> bool:
-        """Whether there are no samples."""
-        return not self._samples
-
-    @property
-    def complete(self) -> bool:
-        """Whether every sensor of the trial has reported."""
-        return all(aid.section in self._aids for aid in self._settings.aids)
-
-    def add_samples(self, table: Array) -> None:
-        """Add IMU samples (N, 7): time, angular rate, specific force."""
-        if table.shape[0]:
-            self._samples.append(table)
-            while self._samples[-1][-1, 0] - self._samples[0][-1, 0] > self._longest:
-                self._samples.pop(0)
-
-    def add_aid(self, record: Aid) -> None:
-        """Add rows of a sensor."""
-        self._aids.setdefault(record.section, []).append(record)
-
-    def reject(self, label: str, time: Array) -> None:
-        """Mark measurements of a kind, by their times, s, as rejected by the innovation gate."""
-        if time.size:
-            self._rejected.setdefault(label, []).append(time)
-
-    def without_rejected(self, frame: LocalFrame) -> RecordHistory | None:
-        """Return the history without the rejected rows, None if there are none."""
-        if not self._rejected:
-            return None
-        out = copy(self)
-        out._rejected = {}
-        out._aids = {}
-        for section, records in self._aids.items():
-            record = joined(records)
-            kinds = {
-                o.label for o in record.observations(frame, self._settings.body_axes)
-            } & self._rejected.keys()
-            times = [time for kind in kinds for time in self._rejected[kind]]
-            if times:
-                record = rows_of(record, ~np.isin(record.time, np.concatenate(times)))
-            if record.time.size:
-                out._aids[section] = [record]
-        return out
-
-    def shift_samples(self, since: float, by: float) -> None:
-        """Move the IMU samples at and after a time by some seconds."""
-        table = np.concatenate(self._samples)
-        table[table[:, 0] >= since, 0] += by
-        self._samples = [table]
-
-    def remove_after(self, since: float) -> list[Aid]:
-        """Remove the sensors' rows at and after a time, s, and return them."""
-        out = []
-        for section, records in list(self._aids.items()):
-            record = joined(records)
-            later = record.time >= since
-            if later.any():
-                out.append(rows_of(record, later))
-                self._aids[section] = [rows_of(record, ~later)]
-        return out
-
-    def trial(self, until: float) -> Trial:
-        """Return the records up to a time, s, as a trial."""
-        whole = np.concatenate(self._samples)
-        self._samples = [whole]
-        samples = whole[whole[:, 0] <= until + _ROUNDING]
-        aids: dict[str, Aid] = {}
-        for section, records in self._aids.items():
-            record = joined(records)
-            # Rows from before the first sample are of no use, and end here.
-            keep = np.flatnonzero(record.time >= self.start - self._before)
-            if keep.size:
-                record = rows_of(record, keep)
-                self._aids[section] = [record]
-                aids[section] = record
-        settings = self._settings
-        imu = replace(
-            settings.inertial,
-            time=samples[:, 0],
-            gyro=samples[:, 1:4],
-            accel=samples[:, 4:7],
-            prior=settings.inertial.prior_after(samples[0, 0] - settings.inertial.time[0]),
-        )
-        if settings.inertial.time[0] < samples[0, 0] - 1.0:
-            # What `initial` states is of a start that has been dropped.
-            settings = replace(
-                settings, initial_attitude=None, initial_position=None, initial_velocity=None
-            )
-        # A sensor that has not reported yet must not be known of: its record is of the future.
-        known: dict[str, Any] = dict.fromkeys(aid.section for aid in settings.aids)
-        known |= {
-            aid.section: rows_of(aid, [])
-            for aid in settings.aids
-            if aid.section in self._calibrated and any(p.estimated for p in aid.parameters())
-        }
-        known |= aids
-        named = {f.name: known.pop(f.name) for f in fields(Trial) if f.name in known}
-        others = tuple(aid for aid in known.values() if aid is not None)
-        return replace(settings, imu=imu, others=others, **named)
+AnyStart = ReplayStart | StartWithoutImu
+AnyNavigator = Navigator | NavigatorWithoutImu
 
 
 @dataclass(frozen=True)
@@ -228,7 +89,11 @@ class Initializer:
     """
 
     def __init__(self, settings: Trial, interval: float, progress: Progress) -> None:
-        self.history: RecordHistory | None = RecordHistory(settings, _LONGEST)
+        self.history: RecordHistory | None = (
+            RecordHistory(settings)
+            if settings.imu is None
+            else InertialHistory(settings, _LONGEST)
+        )
         self.findings: list[Finding] = []
         self._settings = settings
         self._interval = interval
@@ -276,8 +141,9 @@ class Initializer:
                 initial_velocity=None,
             )
             sections = navigator.start.sections
-            self.history = RecordHistory(self._settings, _LONGEST, length + 1.0, sections)
-            self.history.add_samples(samples)
+            history = InertialHistory(self._settings, _LONGEST, length + 1.0, sections)
+            history.add_samples(samples)
+            self.history = history
         self._gap = gap
         self._attempt = gap.after + _AFTER_GAP
 
@@ -296,7 +162,8 @@ class Initializer:
         if arrived < start:
             return None
         if np.isnan(self._attempt):
-            self._attempt = start + _FIRST
+            without = self._settings.imu is None
+            self._attempt = start + (_FIRST_WITHOUT_IMU if without else _FIRST)
         elif self._attempt <= start:
             self.findings.append(
                 Finding(
@@ -317,7 +184,7 @@ class Initializer:
         """Solve again soon after a time, s, as a sensor reports for the first time."""
         self._solve_at = min(self._solve_at, time + _SOLVE_AFTER)
 
-    def solve_due(self, navigator: Navigator) -> bool:
+    def solve_due(self, navigator: AnyNavigator) -> bool:
         """Whether a smoother that runs is to be replaced by a new batch solution."""
         if self.history is None:
             return False
@@ -328,8 +195,8 @@ class Initializer:
         return now >= self._solve_at or turned
 
     def solve(
-        self, until: float, dt: float, since: float, navigator: Navigator | None
-    ) -> tuple[ReplayStart | None, ClockJump | None]:
+        self, until: float, dt: float, since: float, navigator: AnyNavigator | None
+    ) -> tuple[AnyStart | None, ClockJump | None]:
         """Solve the records up to a time as a batch.
 
         Parameters
@@ -345,7 +212,7 @@ class Initializer:
 
         Returns
         -------
-        ReplayStart or None
+        ReplayStart or StartWithoutImu or None
             Start, None if the data do not allow one yet.
         ClockJump or None
             Jump of the IMU's clock, if that explains the data and a gap does not.
@@ -373,32 +240,19 @@ class Initializer:
         self._noted.update(start.findings)
         return start, jump
 
-    def release_if_settled(self, before: Navigator, after: Navigator) -> None:
+    def release_if_settled(self, before: AnyNavigator, after: AnyNavigator) -> None:
         """Release the history if the smoother found the same as the batch solution after it."""
         assert self.history is not None
-        if not self.history.complete or before.start.sections != after.start.sections:
+        if not (isinstance(before, Navigator) and isinstance(after, Navigator)):
+            # Without IMU the noise and the strengths of the motion are always a batch solution's.
             return
-        old, new = before.calibration(), after.calibration()
-        if [e.name for e in old.estimates] != [e.name for e in new.estimates]:
-            # A parameter that was stated as known is estimated instead.
+        if not (self.history.complete and after.agrees_with(before)):
             return
-        std = np.sqrt(np.diag(new.covariance))
-        free = std > 0.0
-        moved = np.concatenate(
-            [a.value - b.value for a, b in zip(old.estimates, new.estimates, strict=True)]
-        )
-        agrees = bool(np.all(np.abs(moved[free]) < _AGREEMENT * std[free]))
-        known = all(
-            np.all(np.diag(after.covariance_of(p)) < _SETTLED_ROTATION**2)
-            for p in after.start.parameters
-            if p.rotation
-        )
         duration = after.time - self.history.start
-        noise_known = after.start.noise_known or _GROWTH * duration > _LONGEST
-        if agrees and known and noise_known and not after.undetermined.size:
+        if after.start.noise_known or _GROWTH * duration > _LONGEST:
             self.history = None
 
-    def _begin(self, until: float, since: float) -> ReplayStart | Message:
+    def _begin(self, until: float, since: float) -> AnyStart | Message:
         assert self.history is not None
         trial = self.history.trial(until)
         try:
@@ -407,20 +261,21 @@ class Initializer:
             return message("not_started.since_gap" if self._gap else "not_started.no_position")
         try:
             if self._clock_zero is None:
-                self._clock_zero = float(trial.inertial.time[0])
-            return solve_start(
-                trial, self._prior, self._interval, since, self._progress, self._clock_zero
-            )
+                self._clock_zero = self.history.start
+            report, zero = self._progress, self._clock_zero
+            if trial.imu is None:
+                return solve_start_without_imu(trial, until, since, report, zero)
+            return solve_start(trial, self._prior, self._interval, since, report, zero)
         except FactorgraphDvlError as error:
             return message("not_started.error", error=str(error))
 
-    def _contradicts(self, start: ReplayStart | Message) -> bool:
+    def _contradicts(self, start: AnyStart | Message) -> bool:
         """Whether there is no start, or one whose residuals are larger than they were."""
         return isinstance(start, Message) or start.misfit > _MISFIT * self._usual_misfit
 
     def _without_rejected(
-        self, until: float, since: float, start: ReplayStart | Message, navigator: Navigator
-    ) -> ReplayStart | Message:
+        self, until: float, since: float, start: AnyStart | Message, navigator: AnyNavigator
+    ) -> AnyStart | Message:
         """Return a better start without what the innovation gate rejected, if there is one."""
         whole = self.history
         assert whole is not None
@@ -437,10 +292,10 @@ class Initializer:
         return other
 
     def _with_clock_jump(
-        self, until: float, since: float, start: ReplayStart | Message, gap: Gap, dt: float
-    ) -> tuple[ReplayStart | Message, ClockJump | None]:
+        self, until: float, since: float, start: AnyStart | Message, gap: Gap, dt: float
+    ) -> tuple[AnyStart | Message, ClockJump | None]:
         """Solve as if the IMU went on through a gap, and its clock jumped."""
-        assert self.history is not None
+        assert isinstance(self.history, InertialHistory)
         jump = ClockJump(gap.after, gap.after - gap.before - dt)
         self.history.shift_samples(gap.after, -jump.by)
         other = self._begin(until - jump.by, since)

@@ -8,7 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from factorgraph_dvl.errors import ConfigError, SolveError
+from factorgraph_dvl.errors import SolveError
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import without_restarted_clock
 from factorgraph_dvl.imu.vibration import without_vibration
 from factorgraph_dvl.message import message
@@ -23,7 +24,6 @@ from factorgraph_dvl.quality.verdict import Verdict
 from factorgraph_dvl.replay.record import Recorder, ReplayRecord, Update
 from factorgraph_dvl.replay.samples import LEAST
 from factorgraph_dvl.replay.session import LAG, RATE, Kind, Replay
-from factorgraph_dvl.replay.session_without_imu import MOST_UPDATES_HZ, ReplayWithoutImu
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Calibration, Progress, Solution
 from factorgraph_dvl.trial import Trial
@@ -161,31 +161,34 @@ def _played(
     """Feed a trial without impossible times; the parameters are those of `replay`."""
     # Fails early if the trial has no position.
     trial.frame()
-    if trial.imu is None:
-        return _played_without_imu(trial, smoother, lag_s, rate_hz, progress, watch)
     run = Replay(trial, smoother=smoother, lag_s=lag_s, rate_hz=rate_hz, progress=progress)
     recorder = Recorder()
-    imu = trial.inertial
-    step = 1.0 / rate_hz
+    imu, time = trial.imu, trial.body_sensor.time
     # Gaps cost one step, whatever their length.
-    steps = np.unique(np.floor((imu.time - imu.time[0]) / step))
-    edges = imu.time[0] + step * np.union1d(steps, steps + 1.0)
-    edges[-1] = np.inf
-    samples = np.searchsorted(imu.time, edges)
-    rows = [np.searchsorted(aid.time, edges) for aid in trial.aids]
-    for each in rows:
-        each[0] = 0
+    steps = np.unique(np.floor((time - time[0]) / run.interval))
+    edges = time[0] + run.interval * np.union1d(steps, steps + 1.0)
+    edges[-1] = max([float(time[-1]), *(float(aid.time[-1]) for aid in trial.aids)])
+
+    def parts(time: Array) -> list[tuple[int, int]]:
+        """Return the first rows of each step, and those after them."""
+        first = np.searchsorted(time, edges)
+        first[[0, -1]] = 0, time.size
+        return list(pairwise(first.tolist()))
 
     def take(updates: list[Update]) -> None:
         for update in updates:
-            _take(recorder, update, watch)
+            recorder.add(update)
+            if watch is not None:
+                watch(update)
 
-    for j, (a, b) in enumerate(pairwise(samples.tolist())):
-        for aid, each in zip(trial.aids, rows, strict=True):
-            first, last = each[j : j + 2].tolist()
+    of_aids = [parts(aid.time) for aid in trial.aids]
+    for end, (a, b), *others in zip(edges[1:].tolist(), parts(time), *of_aids, strict=True):
+        for aid, (first, last) in zip(trial.aids, others, strict=True):
             if last > first:
                 run.add(rows_of(aid, slice(first, last)))
-        if b > a:
+        if imu is None:
+            take(run.advance(end))
+        elif b > a:
             take(run.add_imu(imu.time[a:b], imu.gyro[a:b], imu.accel[a:b]))
     take(run.finish())
     if recorder.last is None:
@@ -193,52 +196,12 @@ def _played(
     return _solution(trial, run, recorder, recorder.last), recorder.record(run.delay)
 
 
-def _played_without_imu(
-    trial: Trial,
-    smoother: Kind,
-    lag_s: float,
-    rate_hz: float,
-    progress: Progress | None,
-    watch: Watch | None,
-) -> tuple[Solution, ReplayRecord]:
-    """Read a trial without IMU step by step; the parameters are those of `replay`."""
-    if smoother != "fixed-lag":
-        raise ConfigError(
-            f"smoother is {smoother!r}, which needs an IMU", expected="fixed-lag, without an IMU"
-        )
-    run = ReplayWithoutImu(trial, lag_s, progress or (lambda stage, iteration, cost: None))
-    recorder = Recorder()
-    time = trial.body_sensor.time
-    end = float(max(aid.time[-1] for aid in trial.aids))
-    steps = np.arange(time[0], end, 1.0 / min(rate_hz, MOST_UPDATES_HZ))
-    update: Update | None = None
-    for until in (*steps.tolist(), end):
-        for following in run.advance(until, end=until == end):
-            if update is not None:
-                _take(recorder, update, watch)
-            update = following
-    if update is None:
-        raise _never_started(trial, run)
-    last = run.finished(update)
-    _take(recorder, last, watch)
-    return _solution(trial, run, recorder, last), recorder.record(run.delay)
-
-
-def _take(recorder: Recorder, update: Update, watch: Watch | None) -> None:
-    """Record an update, and show it."""
-    recorder.add(update)
-    if watch is not None:
-        watch(update)
-
-
-def _never_started(trial: Trial, run: Replay | ReplayWithoutImu) -> SolveError:
+def _never_started(trial: Trial, run: Replay) -> SolveError:
     why = "; ".join(map(str, run.findings)) or "the record is too short"
     return SolveError(f"the data were never sufficient to start: {why}", where=trial.name)
 
 
-def _solution(
-    trial: Trial, run: Replay | ReplayWithoutImu, recorder: Recorder, last: Update
-) -> Solution:
+def _solution(trial: Trial, run: Replay, recorder: Recorder, last: Update) -> Solution:
     calibration = last.calibration
     residuals = recorder.residuals()
     findings = [*trial.notes]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.imu.increments import MAX_FILLED, increments, unbroken_increments
 from factorgraph_dvl.imu.preintegration import Segments, one_segment
@@ -53,8 +54,8 @@ class SampleBuffer:
 
     Parameters
     ----------
-    settings : ImuSettings
-        Settings of the IMU.
+    settings : ImuSettings or None
+        Settings of the IMU; None of a trial without one.
 
     Attributes
     ----------
@@ -68,7 +69,7 @@ class SampleBuffer:
         Number of samples that were not used, and of those that were lost and interpolated.
     """
 
-    def __init__(self, settings: ImuSettings) -> None:
+    def __init__(self, settings: ImuSettings | None) -> None:
         self._settings = settings
         self._table = np.empty((0, 7))
         # Their times in a row of memory; and their numbers, lost ones counted, once `dt` is known.
@@ -111,6 +112,8 @@ class SampleBuffer:
         float
             Jump of the clock back, s; 0 if there was none.
         """
+        if self._settings is None:
+            raise ConfigError("the trial has no IMU", where="trial.yaml", expected="an imu section")
         if table.shape[0] and not _are_possible(table):
             good = np.all(np.isfinite(table), axis=1)
             self.rejected += int((~good).sum())
@@ -215,6 +218,7 @@ class SampleBuffer:
             The segment; the gap that follows the start at once; None if the samples have not
             come so far.
         """
+        assert self._settings is not None
         t = self._time
         gap = self.gap_after(start)
         count = t.size if gap is None else int(t.searchsorted(gap.before, side="right"))

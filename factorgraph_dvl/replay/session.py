@@ -27,10 +27,13 @@ from factorgraph_dvl.replay.arrivals import (
     PendingMeasurements,
 )
 from factorgraph_dvl.replay.gate import InnovationGate
-from factorgraph_dvl.replay.initializer import Initializer
+from factorgraph_dvl.replay.history import InertialHistory
+from factorgraph_dvl.replay.initializer import AnyNavigator, Initializer
 from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.navigator_without_imu import DELAY, NavigatorWithoutImu
 from factorgraph_dvl.replay.record import Update
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
+from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.protocol import Aid, ClocksAid
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
@@ -43,21 +46,24 @@ KINDS: tuple[Kind, ...] = ("fixed-lag", "isam2")
 # within 0.1 standard deviations of a batch solution.
 LAG = 30.0
 RATE = 5.0
+# Most updates a second without an IMU; chosen: states come with pings, and are behind them by
+# seconds anyway.
+_MOST_WITHOUT_IMU = 0.5
 
 
 class Replay:
     """Smoother for a live feed: give it measurements as they arrive.
 
-    An estimate for time t needs IMU samples up to t + `delay`; it uses what else was
-    measured up to t and has arrived by then. Later arrivals correct it as long as their
-    time is within the lag.
+    An estimate for time t needs IMU samples up to t + `delay`, or records of a trial without IMU;
+    it uses what else was measured up to t and has arrived by then. Later arrivals correct it as
+    long as their time is within the lag.
 
     Parameters
     ----------
     settings : Trial
-        Trial with an IMU. Everything but its records counts: sensor settings, axes, priors.
+        Everything but its records counts: sensor settings, axes, priors.
     smoother : Kind, default 'fixed-lag'
-        Smoother: `fixed-lag` or `isam2`.
+        Smoother: `fixed-lag` or, with an IMU, `isam2`.
     lag_s : float, optional
         Age beyond which states are no longer corrected, s.
     rate_hz : float, optional
@@ -68,7 +74,7 @@ class Replay:
     Raises
     ------
     ConfigError
-        If an option is out of range, or the trial has no IMU.
+        If an option is out of range, or the trial one in the plane.
 
     Examples
     --------
@@ -97,12 +103,17 @@ class Replay:
         for name, value in (("lag_s", lag_s), ("rate_hz", rate_hz)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name} is {value}", expected="a number above 0")
-        if settings.imu is None:
+        if settings.planar:
             raise ConfigError(
-                "a live feed needs an IMU",
+                "a replay needs the attitude, which heading and log do not have",
                 where="trial.yaml",
-                expected="an imu section",
-                hint="`factorgraph_dvl.replay.replay` takes a recorded trial without one",
+                expected="an `imu`, `ins` or `attitude` section",
+                hint="Ranges leave several tracks open, often to the end: `solve` weighs them",
+            )
+        if settings.imu is None and smoother != "fixed-lag":
+            raise ConfigError(
+                f"smoother is {smoother!r}, which needs an IMU",
+                expected="fixed-lag, without an IMU",
             )
         self._findings: list[Finding] = []
         self._settings = settings
@@ -110,18 +121,21 @@ class Replay:
         self._kind = smoother
         self._lag = lag_s
         self._interval = 1.0 / rate_hz
-        self._samples = SampleBuffer(settings.inertial.settings)
+        if settings.imu is None:
+            self._interval = max(self._interval, 1.0 / _MOST_WITHOUT_IMU)
+        self._samples = SampleBuffer(settings.imu.settings if settings.imu else None)
+        # Time, s, up to which all has arrived of a trial without IMU.
+        self._reached = -np.inf
         self._initializer = Initializer(
             settings, self._interval, progress or (lambda stage, iteration, cost: None)
         )
-        self._navigator: Navigator | None = None
+        self._navigator: AnyNavigator | None = None
         self._noise: tuple[Noise, ...] = ()
         self._gate = InnovationGate()
         self._pending = PendingMeasurements(settings.body_axes)
         self._duplicates = Duplicates()
         self._clocks = Clocks()
         self._outages = Outages()
-        self._smoothed_to = 0
         self._newest_state = -np.inf
         # End of the trajectory that updates have carried: a new batch solution corrects rounded
         # stamps, and its state may be some microseconds off.
@@ -131,8 +145,13 @@ class Replay:
 
     @property
     def delay(self) -> float:
-        """Time by which estimates are behind the newest IMU sample, s."""
-        return self._samples.delay
+        """Time by which estimates are behind the newest IMU sample, or the records, s."""
+        return DELAY if self._settings.imu is None else self._samples.delay
+
+    @property
+    def interval(self) -> float:
+        """Time between updates, s."""
+        return self._interval
 
     @property
     def started(self) -> bool:
@@ -194,6 +213,11 @@ class Replay:
             Angular rate in body axes.
         accel : array_like, shape (3,) or (N, 3), m/s²
             Specific force in body axes.
+
+        Raises
+        ------
+        ConfigError
+            If the trial has no IMU.
         """
         time = np.atleast_1d(np.asarray(time, dtype=float)) + self._clocks.imu
         table = np.column_stack([time, np.reshape(gyro, (-1, 3)), np.reshape(accel, (-1, 3))])
@@ -207,8 +231,21 @@ class Replay:
                     "IMU",
                 )
             )
-        if self._initializer.history is not None:
+        if isinstance(self._initializer.history, InertialHistory):
             self._initializer.history.add_samples(used)
+        return list(self._advance(end=False))
+
+    def advance(self, time: float) -> list[Update]:
+        """Say that all that was measured without an IMU up to a time, s, has arrived.
+
+        Returns
+        -------
+        list of Update
+            The updates that this makes possible.
+        """
+        self._reached = time
+        for section in self._pending.sections:
+            self._due(section, time + 2.0 * SAME_TIME)
         return list(self._advance(end=False))
 
     def add(self, record: Aid) -> None:
@@ -235,8 +272,13 @@ class Replay:
     def finish(self) -> list[Update]:
         """Return the updates that the last samples allow, without waiting for more."""
         out = list(self._advance(end=True))
-        if out and self._navigator is not None:
-            out[-1] = replace(out[-1], smoothed=self._smooth(self._navigator, -1.0))
+        nav = self._navigator
+        rest = None if nav is None else nav.smoothed(self._settings.body_axes, rest=True)
+        if nav is not None and rest is not None:
+            if not out:
+                nothing = nav.last_segment(self._settings.body_axes, nav.time)
+                out = [self._update(nav, perf_counter(), nothing, solved=False, end=True)]
+            out[-1] = replace(out[-1], smoothed=rest)
         return out
 
     def _advance(self, *, end: bool) -> Iterator[Update]:
@@ -249,36 +291,60 @@ class Replay:
                     return
                 nav = self._start(until)
                 if nav is not None:
-                    self._trajectory_to = nav.time
-                    motion = _constantly(nav.start.trajectory)
-                    yield self._update(nav, began, motion, solved=True, end=end)
-                elif end and until >= self._samples.newest - self._samples.delay:
+                    motion = nav.start.trajectory
+                    self._trajectory_to = float(np.max(motion.time, initial=nav.time))
+                    yield self._update(nav, began, _constantly(motion), solved=True, end=end)
+                elif end and until >= self._arrived:
                     return
                 continue
-            wanted = self._next_own_state(nav)
-            seg = self._samples.segment_after(nav.time, self._interval, wanted, end=end)
-            if seg is None:
-                return
-            if isinstance(seg, Gap):
-                self._restart(nav, seg)
+            extended = self._extend(nav, end=end)
+            if isinstance(extended, Gap):
+                self._restart(nav, extended)
                 continue
-            until = float(seg.node_time[1])
-            last = end and until > self._samples.newest - 0.5 * self._samples.dt
-            if last:
-                # No segment follows that what was measured right now would belong to.
-                until += 2.0 * SAME_TIME
-            nav.extend(seg, self._take(nav, until))
+            if not extended:
+                return
             if self._initializer.history is not None:
                 for i in nav.innovations:
                     self._initializer.history.reject(i.label, i.time[~i.used])
-            self._samples.forget(nav.time)
             trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
             self._trajectory_to = nav.time
             # What has not settled by the end is solved once more.
-            due = self._initializer.solve_due(nav) or (last and not self.settled)
+            due = self._initializer.solve_due(nav) or (
+                end and not self.settled and self._is_last(nav.time)
+            )
             again = self._solve_again(nav) if due else None
             known, solved = (nav, False) if again is None else (again, True)
             yield self._update(known, began, trajectory, solved=solved, end=end)
+
+    @property
+    def _arrived(self) -> float:
+        """Time, s, up to which records can be solved."""
+        if self._settings.imu is None:
+            return self._reached
+        return self._samples.newest - self.delay if self._samples.dt else -np.inf
+
+    def _is_last(self, time: float) -> bool:
+        """Whether a state at a time, s, is at the last sample of the IMU."""
+        return self._settings.imu is not None and (
+            time > self._samples.newest - 0.5 * self._samples.dt
+        )
+
+    def _extend(self, nav: AnyNavigator, *, end: bool) -> bool | Gap:
+        """Extend a navigator; return whether what has arrived does, or the gap that follows."""
+        if isinstance(nav, NavigatorWithoutImu):
+            assert self._initializer.history is not None
+            return nav.advance(self._initializer.history, self._reached, end=end)
+        wanted = self._next_own_state(nav)
+        seg = self._samples.segment_after(nav.time, self._interval, wanted, end=end)
+        if seg is None or isinstance(seg, Gap):
+            return seg or False
+        until = float(seg.node_time[1])
+        if end and self._is_last(until):
+            # No segment follows that what was measured right now would belong to.
+            until += 2.0 * SAME_TIME
+        nav.extend(seg, self._take(nav, until))
+        self._samples.forget(nav.time)
+        return True
 
     def _next_own_state(self, nav: Navigator) -> float:
         """Return the time of the next attitude that needs a state of its own, s."""
@@ -286,8 +352,9 @@ class Replay:
         times = (self._pending.first_after(s, after) for s in nav.start.own_states)
         return min(times, default=np.inf)
 
-    def _restart(self, nav: Navigator, gap: Gap) -> None:
+    def _restart(self, nav: AnyNavigator, gap: Gap) -> None:
         """End the inertial chain at a gap of the IMU."""
+        assert isinstance(nav, Navigator)
         self._initializer.restart(gap, nav, self._samples.since(gap.after))
         self._outages.reset()
         self._samples.forget(gap.after)
@@ -295,22 +362,24 @@ class Replay:
 
     def _attempt_due(self, *, end: bool) -> float | None:
         """Return the time up to which a start is to be attempted now, None if it is too early."""
-        history = self._initializer.history
-        if history is None or history.empty or self._samples.dt == 0.0:
+        if self._initializer.history is None or not np.isfinite(self._arrived):
             return None
-        return self._initializer.attempt_due(self._samples.newest - self.delay, end=end)
+        return self._initializer.attempt_due(self._arrived, end=end)
 
-    def _start(self, until: float) -> Navigator | None:
+    def _start(self, until: float) -> AnyNavigator | None:
         """Solve the records up to a time, and start from there if that succeeds."""
         for section in self._pending.sections:
             self._due(section, until)
         self._samples.forget(until)
-        return self._solve(until, self._trajectory_to)
+        return self._solve(until)
 
-    def _solve(self, until: float, since: float) -> Navigator | None:
+    def _solve(self, until: float) -> AnyNavigator | None:
         """Replace the navigator by one from a batch solution; return it, None on failure."""
-        start, jump = self._initializer.solve(until, self._samples.dt, since, self._navigator)
-        if jump is not None and self._initializer.history is not None:
+        start, jump = self._initializer.solve(
+            until, self._samples.dt, self._trajectory_to, self._navigator
+        )
+        if jump is not None:
+            assert isinstance(self._initializer.history, InertialHistory)
             self._samples.shift(jump.since, -jump.by)
             self._clocks.jumped_ahead(jump.by)
             for record in self._initializer.history.remove_after(until - jump.by):
@@ -319,18 +388,23 @@ class Replay:
             return None
         self._deferred.clear()
         self._noise = start.noise
-        lag = self._lag if self._kind == "fixed-lag" else None
-        self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
-        self._samples.smoothing, self._samples.longest = start.smoothing, start.longest
-        self._smoothed_to = start.node
+        if isinstance(start, ReplayStart):
+            lag = self._lag if self._kind == "fixed-lag" else None
+            self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
+            self._samples.smoothing, self._samples.longest = start.smoothing, start.longest
+        else:
+            before = self._navigator
+            assert before is None or isinstance(before, NavigatorWithoutImu)
+            self._navigator = NavigatorWithoutImu(start, self._gate, lag=self._lag, before=before)
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.
         gc.collect()
         gc.freeze()
         return self._navigator
 
-    def _solve_again(self, before: Navigator) -> Navigator | None:
+    def _solve_again(self, before: AnyNavigator) -> AnyNavigator | None:
         """Replace a navigator that runs by one from a new batch solution; None on failure."""
-        after = self._solve(before.time, np.inf)
+        until = before.time if isinstance(before, Navigator) else self._reached
+        after = self._solve(until)
         if after is not None:
             self._initializer.release_if_settled(before, after)
             after.innovations, after.findings = before.innovations, before.findings
@@ -393,7 +467,7 @@ class Replay:
         nav = self._navigator
         frame, values, clock_zero = None, {}, 0.0
         # Before its first measurement a sensor's clock offset is not known.
-        if nav is not None and section in nav.start.sections:
+        if isinstance(nav, Navigator) and section in nav.start.sections:
             frame, values, clock_zero = nav.start.frame, nav.values, nav.start.clock_zero
         found = self._pending.due(section, end, frame, values, clock_zero)
         if found is None or not self._measures(found[0]):
@@ -415,7 +489,7 @@ class Replay:
 
     def _update(
         self,
-        nav: Navigator,
+        nav: AnyNavigator,
         began: float,
         trajectory: Callable[[], Trajectory],
         *,
@@ -424,10 +498,6 @@ class Replay:
     ) -> Update:
         """Return what is known now; `trajectory` since the update before."""
         self._newest_state = nav.time
-        smoothed = None
-        oldest = nav.smoother.times.get(self._smoothed_to, np.inf)
-        if not end and nav.time - oldest > self._lag - 2.0 * self._interval:
-            smoothed = self._smooth(nav, 0.5 * self._lag)
         findings = (
             *self.findings,
             *self._outages.findings(nav.time, nav.innovations),
@@ -442,22 +512,12 @@ class Replay:
             find_state=nav.newest(self._settings.body_axes),
             find_trajectory=trajectory,
             find_calibration=nav.find_calibration(),
-            smoothed=smoothed,
+            smoothed=None if end else nav.smoothed(self._settings.body_axes),
             innovations=innovations,
             findings=findings,
             solved=solved,
             inconsistent=tuple(sorted(self._gate.inconsistent)),
         )
-
-    def _smooth(self, nav: Navigator, age: float) -> Trajectory | None:
-        """Return the motion before an age, s, that was not returned before."""
-        s = nav.smoother
-        last = next((k for k, t in s.times.items() if t > nav.time - age), s.node + 1) - 1
-        if last <= self._smoothed_to:
-            return None
-        out = nav.smoothed(self._smoothed_to, last, self._settings.body_axes)
-        self._smoothed_to = last
-        return out
 
 
 def _constantly(trajectory: Trajectory) -> Callable[[], Trajectory]:

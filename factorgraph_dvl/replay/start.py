@@ -53,6 +53,8 @@ class ReplayStart:
         Index of the state.
     time : float
         Its time, s.
+    interval : float
+        Interval of the states to come, s.
     prior : gtsam.NonlinearFactorGraph
         Linear factors on state, bias and parameters that stand for all records so far.
     values : gtsam.Values
@@ -96,6 +98,7 @@ class ReplayStart:
     body_axes: BodyAxes
     node: int
     time: float
+    interval: float
     prior: gtsam.NonlinearFactorGraph
     values: gtsam.Values
     parameters: tuple[Parameter, ...]
@@ -222,6 +225,7 @@ def _condensed(
         body_axes=trial.body_axes,
         node=last,
         time=time,
+        interval=interval,
         prior=gtsam.LinearContainerFactor.ConvertLinearGraph(rest, values),
         values=values,
         parameters=problem.parameters,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from truth import scenario
 
-from factorgraph_dvl.replay.initializer import RecordHistory
+from factorgraph_dvl.replay.history import InertialHistory
 from factorgraph_dvl.simulation import simulate
 
 
 def history(trial, **changes):
-    out = RecordHistory(trial, **({"longest": 1800.0} | changes))
+    out = InertialHistory(trial, **({"longest": 1800.0} | changes))
     imu = trial.imu
     out.add_samples(np.column_stack([imu.time, imu.gyro, imu.accel]))
     return out
@@ -51,7 +51,7 @@ def test_samples_are_shifted_after_a_time_and_old_ones_dropped():
     out.shift_samples(float(time[100]), 0.5)
     np.testing.assert_array_equal(out.trial(np.inf).imu.time[:100], time[:100])
     np.testing.assert_allclose(out.trial(np.inf).imu.time[100:], time[100:] + 0.5)
-    short = RecordHistory(trial, 5.0)
+    short = InertialHistory(trial, 5.0)
     table = np.column_stack([time, trial.imu.gyro, trial.imu.accel])
     for block in np.array_split(table, 40):
         short.add_samples(block)
