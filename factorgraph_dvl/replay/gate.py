@@ -15,6 +15,8 @@ from factorgraph_dvl.graph.sensor_factor import NodeMeasurements
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.record import Innovations
+from factorgraph_dvl.sensors.protocol import Observation
+from factorgraph_dvl.statistics.rows import add_transposed_product, product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
@@ -97,6 +99,24 @@ class InnovationGate:
         used = [not (excluded or outlier) for outlier in beyond]
         self.rejected[label] += used.count(False)
         return np.array(used, dtype=bool), finding
+
+    def compared(
+        self, o: Observation, time: Array, found: Array, spread: Array
+    ) -> tuple[Innovations, list[Finding]]:
+        """Return innovations (M, d) of a kind at times (M,), s, and what changes by them.
+
+        Parameters
+        ----------
+        o : Observation
+            The kind.
+        time : ndarray, shape (M,), s
+            Times of the measurements.
+        found, spread : ndarray, shape (M, d)
+            Innovations and their standard deviations; nan where a component was not measured.
+        """
+        used, finding = self.accept(o.label, found / spread, o.gate)
+        innovations = Innovations(o.label, o.unit, o.components, time, found, spread, used)
+        return innovations, [] if finding is None else [finding]
 
     def _judge(self, label: str, limit: float, echoes: bool) -> Finding | None:
         readmit, exclude = (
@@ -185,10 +205,10 @@ def gated(
         part = slice(first, first + shape[0] * shape[1])
         first = part.stop
         found, spread = all_found[part].reshape(shape), all_spread[part].reshape(shape)
-        used, finding = gate.accept(o.label, found / spread, o.gate)
-        findings += [] if finding is None else [finding]
-        weights.append(used[:, None] / sigma[part].reshape(shape))
-        innovations.append(Innovations(o.label, o.unit, o.components, o.time, found, spread, used))
+        own, finding = gate.compared(o, o.time, found, spread)
+        findings += finding
+        weights.append(own.used[:, None] / sigma[part].reshape(shape))
+        innovations.append(own)
     return weights, innovations, findings
 
 
@@ -234,47 +254,27 @@ def judged(
         Gate, which remembers what it sees.
     """
     by_label = {b.observation.label: b for b in problem.bound}
-    rows = []
+    step = predicted.solution()
+    innovations, rejected, findings = [], {}, []
     for each in problem.observation_rows(evaluation):
         own = each.begin + np.flatnonzero(new[each.source][each.begin :][: len(each.vector)])
-        if own.size:
-            rows.append((own, _some(each, own - each.begin)))
-    if not rows:
-        return Judged((), {}, ())
-    # Of the variables of all new measurements.
-    place: dict[int, slice] = {}
-    size = 0
-    for _, each in rows:
-        for keys in each.keys.tolist():
-            for key, width in zip(keys, each.sizes, strict=True):
-                if key not in place:
-                    place[key] = slice(size, size + width)
-                    size += width
-    step = predicted.solution()
-    off, every = np.empty(size), {}
-    for key, columns in place.items():
-        off[columns] = step.at(key)
-        every[key] = np.eye(size)[:, columns]
-    P = predicted.covariance_of([every])
-    innovations, rejected, findings = [], {}, []
-    for own, each in rows:
-        o = by_label[each.source].observation
-        matrix = _scattered(each, place, size)
-        residual = each.vector.ravel() + matrix @ off
-        found, spread = _one_after_another(residual, matrix @ P @ matrix.T, each.vector.shape)
-        weight = by_label[each.source].weight[own]
-        there = weight > 0.0
-        found, spread = (np.where(there, x, np.nan) for x in (found, spread))
-        used, finding = gate.accept(o.label, found / spread, o.gate)
-        findings += [] if finding is None else [finding]
-        if not used.all():
-            rejected[o.label] = o.time[own][~used]
-        scale = np.where(there, weight, 1.0)
-        innovations.append(
-            Innovations(
-                o.label, o.unit, o.components, o.time[own], found / scale, spread / scale, used
-            )
-        )
+        if not own.size:
+            continue
+        rows = _some(each, own - each.begin)
+        moved = {key: step.at(key)[:, None] for key in np.unique(rows.keys).tolist()}
+        residual = rows.vector + product(rows, moved)[..., 0]
+        every = np.eye(residual.size).reshape(*residual.shape, -1)
+        functional: dict[int, Array] = {}
+        add_transposed_product(rows, every, functional)
+        P = predicted.covariance_of([functional])
+        found, spread = _one_after_another(residual.ravel(), P, residual.shape)
+        o, weight = by_label[each.source].observation, by_label[each.source].weight[own]
+        scale = np.where(weight > 0.0, weight, np.nan)
+        innovation, finding = gate.compared(o, o.time[own], found / scale, spread / scale)
+        findings += finding
+        if not innovation.used.all():
+            rejected[o.label] = innovation.time[~innovation.used]
+        innovations.append(innovation)
     return Judged(tuple(innovations), rejected, tuple(findings))
 
 
@@ -288,16 +288,6 @@ def _some(rows: Rows, some: IntArray) -> Rows:
         rows.matrix[some],
         rows.vector[some],
     )
-
-
-def _scattered(rows: Rows, place: Mapping[int, slice], size: int) -> Array:
-    """Return the Jacobian of rows by all variables that have a place, (M d, size)."""
-    out = np.zeros((*rows.vector.shape, size))
-    edges = np.cumsum([0, *rows.sizes])
-    for i, keys in enumerate(rows.keys.tolist()):
-        for key, first, last in zip(keys, edges[:-1], edges[1:], strict=True):
-            out[i, :, place[key]] += rows.matrix[i, :, first:last]
-    return out.reshape(-1, size)
 
 
 def _one_after_another(

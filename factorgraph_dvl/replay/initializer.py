@@ -279,7 +279,7 @@ class Initializer:
         """Return a better start without what the innovation gate rejected, if there is one."""
         whole = self.history
         assert whole is not None
-        fewer = whole.without_rejected(navigator.start.frame)
+        fewer = whole.without_rejected(navigator.frame)
         if fewer is None:
             return start
         self.history = fewer

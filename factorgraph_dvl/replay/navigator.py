@@ -127,6 +127,10 @@ class Navigator:
     ----------
     smoother : Smoother
         Incremental smoother.
+    frame : LocalFrame
+        Navigation frame of the states.
+    first_motion : Trajectory
+        Motion that the start has found.
     values : dict of str to ndarray
         Values of all parameters, SI; rotations as matrices.
     undetermined : ndarray, shape (P, h)
@@ -146,6 +150,7 @@ class Navigator:
         memory: float,
     ) -> None:
         self.start = start
+        self.frame, self.first_motion = start.frame, start.trajectory
         self._gate = gate
         self._memory = memory
         self._smoothed_to = start.node

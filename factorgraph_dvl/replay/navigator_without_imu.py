@@ -163,6 +163,10 @@ class NavigatorWithoutImu:
     ----------
     window : Window
         The newest nodes.
+    frame : LocalFrame
+        Navigation frame of the nodes.
+    first_motion : Trajectory
+        Motion that the start has found.
     rotation_change : float
         None that counts: every window is linear where the constants are.
     innovations : list of Innovations
@@ -181,7 +185,8 @@ class NavigatorWithoutImu:
         lag: float,
         before: NavigatorWithoutImu | None = None,
     ) -> None:
-        self.start, self._batch = start, start.batch
+        self._batch = start.batch
+        self.frame, self.first_motion = start.frame, start.trajectory
         self._gate, self._lag = gate, lag
         self.innovations: list[Innovations] = []
         self.findings: list[Finding] = []

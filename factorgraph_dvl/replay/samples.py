@@ -113,7 +113,9 @@ class SampleBuffer:
             Jump of the clock back, s; 0 if there was none.
         """
         if self._settings is None:
-            raise ConfigError("the trial has no IMU", where="trial.yaml", expected="an imu section")
+            raise ConfigError(
+                "the trial has no IMU", where="trial.yaml", expected="an imu section"
+            )
         if table.shape[0] and not _are_possible(table):
             good = np.all(np.isfinite(table), axis=1)
             self.rejected += int((~good).sum())

@@ -291,7 +291,7 @@ class Replay:
                     return
                 nav = self._start(until)
                 if nav is not None:
-                    motion = nav.start.trajectory
+                    motion = nav.first_motion
                     self._trajectory_to = float(np.max(motion.time, initial=nav.time))
                     yield self._update(nav, began, _constantly(motion), solved=True, end=end)
                 elif end and until >= self._arrived:

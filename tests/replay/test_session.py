@@ -345,7 +345,7 @@ def test_what_never_starts_says_why():
 
 
 def test_a_track_in_the_plane_is_refused_with_what_to_do():
-    with pytest.raises(ConfigError, match="several tracks open.*`solve`"):
+    with pytest.raises(ConfigError, match=r"several tracks open.*`solve`"):
         replay(planar.trial())
 
 

@@ -14,7 +14,7 @@ from truth import CONFIGS, SCHULER, with_ins
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.quality.finding import Code
-from factorgraph_dvl.replay import replay
+from factorgraph_dvl.replay import Replay, replay
 from factorgraph_dvl.replay.calibration import CalibrationReport
 from factorgraph_dvl.replay.window import Window
 from factorgraph_dvl.sensors.records import rows_of
@@ -117,6 +117,33 @@ def test_what_comes_later_changes_nothing(ship, played):
     same = np.searchsorted(early.time, end - early.delay - 6.0)
     assert same > 4
     np.testing.assert_allclose(early.values[:same], whole.values[:same], rtol=1e-9, atol=1e-12)
+
+
+def test_a_live_feed_knows_what_a_recorded_trial_does(ship, played):
+    """Rows come one by one; fixes a second late, which counts for nothing behind the delay."""
+    session = Replay(ship, rate_hz=0.2)
+    assert session.delay == played[1].delay
+    late = {"gnss": 1.0}
+    rows = sorted(
+        (float(time) + late.get(aid.section, 0.0), i, k)
+        for i, aid in enumerate(ship.aids)
+        for k, time in enumerate(aid.time)
+        if time < 85.0
+    )
+    updates, step = [], ship.attitude.time[0]
+    for time, i, k in rows:
+        while time >= step:
+            updates += session.advance(step)
+            step += session.interval
+        session.add(rows_of(ship.aids[i], np.array([k])))
+    whole = played[1]
+    known = [np.concatenate([e.value for e in u.calibration.estimates]) for u in updates]
+    assert len(known) > 3
+    std = whole.std[: len(known)]
+    assert np.nanmax(np.abs(known - whole.values[: len(known)]) / std) < 0.3
+    late_ones = session.finish()
+    assert late_ones[-1].smoothed is not None
+    assert not session.settled
 
 
 @pytest.mark.slow
