@@ -211,15 +211,11 @@ class InertialChain(AtTrueTimes):
         return replace(self, segments=own, gravity_n=self.gravity_n[i : i + 1])
 
     def _states(self, values: gtsam.Values, nodes: range) -> States:
-        # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
-        state = np.empty((len(nodes), 5, 5))
-        for i, k in enumerate(nodes):
-            state[i] = values.atNavState(keys.node(k)).matrix()
-        nRb, p_n, v_n = (state[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
         own = nodes if self.walking else [0]
-        bias = np.array([values.atConstantBias(keys.bias(k)).vector() for k in own])
-        bias = np.broadcast_to(bias, (len(nodes), BIAS_SIZE))
-        return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])
+        return states_of(
+            [values.atNavState(keys.node(k)) for k in nodes],
+            [values.atConstantBias(keys.bias(k)) for k in own],
+        )
 
     def steps(self, states: States) -> Iterator[StepRows]:
         """Yield nothing: what ties the nodes is in `graph`."""
@@ -535,3 +531,16 @@ def _gap_factor(before: int, after: int, node_time: Array) -> gtsam.CustomFactor
         return np.concatenate([turn, shift, b.velocity() - a.velocity()])
 
     return gtsam.CustomFactor(loose_diagonal(sigma), node_keys, error)
+
+
+def states_of(
+    states: Sequence[gtsam.NavState], biases: Sequence[gtsam.imuBias.ConstantBias]
+) -> States:
+    """Return GTSAM's states of some nodes, with the bias of each or the one of all, as arrays."""
+    # A matrix of GTSAM's is [nRb, p, v; 0, I]: one call takes less than one for each part.
+    matrix = np.array([state.matrix() for state in states])
+    bias = np.array([each.vector() for each in biases])
+    if len(bias) < len(matrix):
+        bias = bias.repeat(len(matrix), axis=0)
+    nRb, p_n, v_n = (matrix[:, :3, part].copy() for part in (slice(0, 3), 3, 4))
+    return States(nRb, p_n, v_n, gyro_bias=bias[:, 3:], accel_bias=bias[:, :3])

@@ -22,7 +22,7 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation, Processes,
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import time_on_chain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.inertial_chain import InertialChain
+from factorgraph_dvl.graph.inertial_chain import InertialChain, states_of
 from factorgraph_dvl.graph.native_graph import custom_factor
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.priors import prior_mean, value_at
@@ -300,23 +300,6 @@ def states_at(values: gtsam.Values, nodes: Sequence[int]) -> States:
     """Return the states of two nodes: keys of state and bias of each, or of a bias of both."""
     biases = [values.atConstantBias(key) for key in nodes[1::2]]
     return states_of([values.atNavState(key) for key in nodes[::2]], biases)
-
-
-def states_of(
-    states: Sequence[gtsam.NavState], biases: Sequence[gtsam.imuBias.ConstantBias]
-) -> States:
-    """Return GTSAM's states of some nodes, with the bias of each or the one of all, as arrays."""
-    matrix = np.array([state.matrix() for state in states])
-    bias = np.array([each.vector() for each in biases])
-    if len(bias) < len(matrix):
-        bias = bias.repeat(len(matrix), axis=0)
-    return States(
-        matrix[:, :3, :3],
-        matrix[:, :3, 3],
-        matrix[:, :3, 4],
-        gyro_bias=bias[:, 3:],
-        accel_bias=bias[:, :3],
-    )
 
 
 def sensor_factor(

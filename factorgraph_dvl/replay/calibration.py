@@ -8,10 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.estimates import Estimate, as_estimates
-from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.keys import BIAS_SIZE
-from factorgraph_dvl.graph.priors import local_coordinates, places, prior_mean, prior_root
+from factorgraph_dvl.graph.priors import (
+    after_step,
+    local_coordinates,
+    places,
+    prior_mean,
+    prior_root,
+)
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.reported import in_order, in_unit
 
@@ -122,10 +127,4 @@ def _at_prior(
     given = P - gain @ A @ P
     given[BIAS_SIZE:, BIAS_SIZE:] += root @ fixed @ fixed.T @ root.T
     given[:BIAS_SIZE, :BIAS_SIZE] = P[:BIAS_SIZE, :BIAS_SIZE]
-    out = dict(values)
-    at = BIAS_SIZE
-    for p in free:
-        part = step[at : at + p.mean.size]
-        at += p.mean.size
-        out[p.name] = out[p.name] @ exp_so3(part) if p.rotation else out[p.name] + part
-    return out, given
+    return after_step(free, values, step[BIAS_SIZE:]), given

@@ -16,7 +16,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.inertial_chain import InertialChain
+from factorgraph_dvl.graph.inertial_chain import InertialChain, states_of
 from factorgraph_dvl.graph.keys import BIAS_SIZE, STATE_SIZE
 from factorgraph_dvl.graph.priors import ConstantsPrior, local_coordinates, value_at
 from factorgraph_dvl.graph.sensor_factor import (
@@ -24,7 +24,6 @@ from factorgraph_dvl.graph.sensor_factor import (
     NodeMeasurements,
     bind,
     measurement_factor,
-    states_of,
 )
 from factorgraph_dvl.graph.trajectory import (
     TRAJECTORY_RATE,

@@ -18,6 +18,7 @@ from scipy.linalg.lapack import dtrtri
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.inertial_chain import states_of
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -204,18 +205,8 @@ class Smoother:
 
     def states(self, wanted: Sequence[int]) -> States:
         """Return the estimates of states, by their indices, with the biases there."""
-        matrices = np.array([self.state(k).matrix() for k in wanted])
-        if self._walking:
-            bias = np.array([self.bias(k).vector() for k in wanted])
-        else:
-            bias = self.bias(self.node).vector()[None].repeat(len(wanted), axis=0)
-        return States(
-            matrices[:, :3, :3],
-            matrices[:, :3, 3],
-            matrices[:, :3, 4],
-            gyro_bias=bias[:, 3:],
-            accel_bias=bias[:, :3],
-        )
+        own = wanted if self._walking else [self.node]
+        return states_of([self.state(k) for k in wanted], [self.bias(k) for k in own])
 
     def state_covariances(self, wanted: Sequence[int]) -> Array:
         """Return covariances (K, 9, 9) of states, by their indices, given all that came since."""

@@ -15,7 +15,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.inertial_chain import InertialChain
-from factorgraph_dvl.graph.priors import ConstantsPrior, prior_mean
+from factorgraph_dvl.graph.priors import ConstantsPrior, places, prior_mean
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.message import Message, message
@@ -131,12 +131,7 @@ class ReplayStart:
 
     def columns(self, names: Collection[str]) -> np.ndarray:
         """Return the indices of some parameters' components among those of all estimated."""
-        ends = np.cumsum([p.mean.size for p in self.parameters])
-        own = [
-            np.arange(end - p.mean.size, end)
-            for p, end in zip(self.parameters, ends, strict=True)
-            if p.name in names
-        ]
+        own = (np.r_[place] for name, place in places(self.parameters).items() if name in names)
         return np.concatenate([np.empty(0, dtype=int), *own])
 
 
