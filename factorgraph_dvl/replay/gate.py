@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.record import Innovations
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.statistics.rows import add_transposed_product, product
+from factorgraph_dvl.statistics.rows import product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations beyond which a measurement is rejected; chosen: 2e-9 of Gaussian errors.
@@ -254,21 +254,29 @@ def judged(
         Gate, which remembers what it sees.
     """
     by_label = {b.observation.label: b for b in problem.bound}
-    step = predicted.solution()
-    innovations, rejected, findings = [], {}, []
+    parts: list[tuple[IntArray, Rows]] = []
+    sizes: dict[int, int] = {}
     for each in problem.observation_rows(evaluation):
         own = each.begin + np.flatnonzero(new[each.source][each.begin :][: len(each.vector)])
-        if not own.size:
-            continue
-        rows = _some(each, own - each.begin)
-        moved = {key: step.at(key)[:, None] for key in np.unique(rows.keys).tolist()}
-        residual = rows.vector + product(rows, moved)[..., 0]
-        every = np.eye(residual.size).reshape(*residual.shape, -1)
-        functional: dict[int, Array] = {}
-        add_transposed_product(rows, every, functional)
-        P = predicted.covariance_of([functional])
-        found, spread = _one_after_another(residual.ravel(), P, residual.shape)
-        o, weight = by_label[each.source].observation, by_label[each.source].weight[own]
+        if own.size:
+            matrix, vector = (part[own - each.begin] for part in (each.matrix, each.vector))
+            keys = each.keys[own - each.begin]
+            parts.append((own, replace(each, keys=keys, matrix=matrix, vector=vector)))
+            for column, size in zip(keys.T, each.sizes, strict=True):
+                sizes |= dict.fromkeys(column.tolist(), size)
+    if not parts:
+        return Judged((), {}, ())
+    P = predicted.covariance_of([{key: np.eye(size)} for key, size in sizes.items()])
+    ends = np.cumsum([*sizes.values()])
+    of_all = dict(zip(sizes, np.split(np.eye(len(P)), ends[:-1]), strict=True))
+    step = predicted.solution()
+    off = np.concatenate([step.at(key) for key in sizes])
+    innovations, rejected, findings = [], {}, []
+    for own, rows in parts:
+        matrix = product(rows, of_all).reshape(-1, len(P))
+        residual = rows.vector.ravel() + matrix @ off
+        found, spread = _one_after_another(residual, matrix @ P @ matrix.T, rows.vector.shape)
+        o, weight = by_label[rows.source].observation, by_label[rows.source].weight[own]
         scale = np.where(weight > 0.0, weight, np.nan)
         innovation, finding = gate.compared(o, o.time[own], found / scale, spread / scale)
         findings += finding
@@ -276,18 +284,6 @@ def judged(
             rejected[o.label] = innovation.time[~innovation.used]
         innovations.append(innovation)
     return Judged(tuple(innovations), rejected, tuple(findings))
-
-
-def _some(rows: Rows, some: IntArray) -> Rows:
-    """Return the rows of some measurements."""
-    return Rows(
-        rows.source,
-        rows.components,
-        rows.keys[some],
-        rows.sizes,
-        rows.matrix[some],
-        rows.vector[some],
-    )
 
 
 def _one_after_another(
