@@ -184,11 +184,10 @@ class Initializer:
         """Solve again soon after a time, s, as a sensor reports for the first time."""
         self._solve_at = min(self._solve_at, time + _SOLVE_AFTER)
 
-    def solve_due(self, navigator: AnyNavigator) -> bool:
-        """Whether a smoother that runs is to be replaced by a new batch solution."""
+    def solve_due(self, navigator: AnyNavigator, now: float) -> bool:
+        """Whether a smoother is to be replaced by a batch solution of the records up to now, s."""
         if self.history is None:
             return False
-        now = navigator.time
         turned = now > self._solved_at + _SOLVE_AFTER and (
             navigator.rotation_change > _ROTATION_CHANGE
         )

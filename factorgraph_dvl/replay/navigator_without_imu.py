@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationR
 from factorgraph_dvl.replay.gate import InnovationGate, judged
 from factorgraph_dvl.replay.history import RecordHistory
 from factorgraph_dvl.replay.record import Innovations
+from factorgraph_dvl.replay.start import largest_misfit
 from factorgraph_dvl.replay.window import (
     BatchSolution,
     Past,
@@ -73,6 +73,8 @@ class StartWithoutImu:
         Motion after the time that `solve_start_without_imu` was given.
     findings : tuple of Finding
         What the user must know.
+    misfit : float
+        Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
     whole: Window
@@ -80,8 +82,7 @@ class StartWithoutImu:
     batch: BatchSolution
     trajectory: Trajectory
     findings: tuple[Finding, ...]
-    # Gross errors are found by the solution itself.
-    misfit: ClassVar[float] = 0.0
+    misfit: float
 
     @property
     def frame(self) -> LocalFrame:
@@ -138,6 +139,7 @@ def solve_start_without_imu(
         BatchSolution.of(prepared, problem, until - clock_zero),
         whole.motion(since, count - 1, trial.body_axes),
         (*prepared.findings, *settled.findings),
+        largest_misfit(problem, minimum.evaluation),
     )
 
 

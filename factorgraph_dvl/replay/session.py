@@ -309,7 +309,7 @@ class Replay:
             trajectory = nav.last_segment(self._settings.body_axes, self._trajectory_to)
             self._trajectory_to = nav.time
             # What has not settled by the end is solved once more.
-            due = self._initializer.solve_due(nav) or (
+            due = self._initializer.solve_due(nav, self._known_to(nav)) or (
                 end and not self.settled and self._is_last(nav.time)
             )
             again = self._solve_again(nav) if due else None
@@ -322,6 +322,10 @@ class Replay:
         if self._settings.imu is None:
             return self._reached
         return self._samples.newest - self.delay if self._samples.dt else -np.inf
+
+    def _known_to(self, nav: AnyNavigator) -> float:
+        """Return the time, s, up to which the history has what a navigator was given."""
+        return nav.time if isinstance(nav, Navigator) else self._reached
 
     def _is_last(self, time: float) -> bool:
         """Whether a state at a time, s, is at the last sample of the IMU."""
@@ -403,8 +407,7 @@ class Replay:
 
     def _solve_again(self, before: AnyNavigator) -> AnyNavigator | None:
         """Replace a navigator that runs by one from a new batch solution; None on failure."""
-        until = before.time if isinstance(before, Navigator) else self._reached
-        after = self._solve(until)
+        after = self._solve(self._known_to(before))
         if after is not None:
             self._initializer.release_if_settled(before, after)
             after.innovations, after.findings = before.innovations, before.findings

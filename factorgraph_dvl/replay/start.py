@@ -250,7 +250,7 @@ def _condensed(
             evaluation.states, covariances.nodes, trial.body_axes, TRAJECTORY_RATE, since
         ),
         findings=settled.findings,
-        misfit=_misfit(problem, evaluation),
+        misfit=largest_misfit(problem, evaluation),
     )
 
 
@@ -286,7 +286,8 @@ def _own_states(trial: Trial, frame: LocalFrame, interval: float) -> tuple[str, 
     return tuple(out)
 
 
-def _misfit(problem: Problem, evaluation: Evaluation) -> float:
+def largest_misfit(problem: Problem, evaluation: Evaluation) -> float:
+    """Return the largest RMS of the residuals of any kind of measurement, over what is stated."""
     out = 0.0
     factors = problem.white_factors
     for o, residual, weight in zip(
