@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from truth import scenario
 
-from factorgraph_dvl.replay.history import InertialHistory
+from factorgraph_dvl.replay.history import InertialHistory, RecordHistory
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.simulation import simulate
 
 
@@ -56,3 +59,23 @@ def test_samples_are_shifted_after_a_time_and_old_ones_dropped():
     for block in np.array_split(table, 40):
         short.add_samples(block)
     assert short.trial(np.inf).imu.time[0] >= time[-1] - 5.0 - (time[-1] - time[0]) / 40.0
+
+
+def test_without_an_imu_rows_that_come_late_are_among_the_newest():
+    trial = replace(simulate(scenario()), imu=None)
+    out = RecordHistory(trial)
+    late, first = 7, float(trial.gnss.time[10])
+    for k in np.delete(np.arange(20), late):
+        out.add_aid(rows_of(trial.gnss, [k]))
+    assert out.start == np.inf
+    out.add_aid(trial.dvl)
+    assert out.start == max(trial.gnss.time[0], trial.dvl.time[0])
+    out.add_aid(rows_of(trial.gnss, [late]))
+    np.testing.assert_array_equal(out.newest(first, 1).gnss.time, trial.gnss.time[11:20])
+    before = float(trial.gnss.time[late - 1])
+    np.testing.assert_array_equal(out.newest(before, 1).gnss.time, trial.gnss.time[late:20])
+    # Of few, some from before.
+    np.testing.assert_array_equal(out.newest(first, 15).gnss.time, trial.gnss.time[5:20])
+    until = out.trial(first)
+    np.testing.assert_array_equal(until.gnss.time, trial.gnss.time[:11])
+    assert until.dvl.time[-1] <= first
