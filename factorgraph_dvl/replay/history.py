@@ -47,11 +47,7 @@ class RecordHistory:
 
     def add_aid(self, record: Aid) -> None:
         """Add rows of a sensor."""
-        records = self._aids.setdefault(record.section, [])
-        records.append(record)
-        # Each is larger than all after it: few have the newest rows, and few are copied for one.
-        while len(records) > 1 and records[-1].time.size >= records[-2].time.size:
-            records[-2:] = [joined(records[-2:])]
+        self._aids.setdefault(record.section, []).append(record)
 
     def reject(self, label: str, time: Array) -> None:
         """Mark measurements of a kind, by their times, s, as rejected by the innovation gate."""
@@ -88,6 +84,9 @@ class RecordHistory:
         """Return the rows after a time, s, as a trial; of each sensor some at least."""
         aids = {}
         for section, records in self._aids.items():
+            # Each is then larger than all after it: few are looked at, and few rows copied.
+            while len(records) > 1 and records[-1].time.size >= records[-2].time.size:
+                records[-2:] = [joined(records[-2:])]
             first = (int(np.searchsorted(r.time, since, side="right")) for r in records)
             parts = [rows_of(r, slice(i, None)) for r, i in zip(records, first, strict=True)]
             found = joined(parts)
