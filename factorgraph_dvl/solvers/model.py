@@ -312,6 +312,27 @@ def with_objective(
     return Estimated(model, problem, minimum, objective, rough)
 
 
+def least_objective(model: Model, states: Any, values: dict[str, Array]) -> float:
+    """Return what the objective of a model would be if measurements left no residual.
+
+    No minimum of it is lower, but for what the volume of the states changes on the way there.
+
+    Parameters
+    ----------
+    model : Model
+        What is assumed.
+    states, values : object and dict of str to ndarray
+        Where its minimisation would start.
+    """
+    problem = model.problem(values)
+    start = problem.evaluate(problem.values(states, problem.prior_values() | values))
+    there = Minimum(problem.weighed(start), None, converged=True, iterations=0)
+    at = with_objective(model, problem, there, rough=True)
+    problem.release()
+    decrease = at.minimum.information.given(constants_of(problem)).decrease
+    return at.objective - 2.0 * (at.minimum.evaluation.cost - decrease)
+
+
 def with_all_digits(at: Estimated) -> Minimum:
     """Return the minimum with square-root information from QR, for its standard deviations."""
     minimum = at.minimum

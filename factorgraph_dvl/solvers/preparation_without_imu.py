@@ -28,9 +28,7 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
-from factorgraph_dvl.message import message
-from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.results import windows_left_out
+from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.clock import CLOCK_STEMS, on_shared_clocks
 from factorgraph_dvl.sensors.ins import Ins
@@ -41,6 +39,7 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
+from factorgraph_dvl.solvers.notes_without_imu import notes_without_imu
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
@@ -254,7 +253,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
             for o in every
             if o.noise_groups and not _followed(o, nodes)
         ),
-        findings=(*trial.notes, *_notes(trial), *_left_out(trial)),
+        findings=(*trial.notes, *notes_without_imu(trial)),
     )
 
 
@@ -384,7 +383,8 @@ def track_axes(
 def _parameters(trial: Trial) -> tuple[Parameter, ...]:
     """Return the parameters of all sensors; the clock of the positions is that of the trial.
 
-    Without an IMU only differences of clocks show.
+    Without an IMU only differences of clocks show, and of lever arms: where the position is
+    stated to be that of the body, it makes the origin, and no misfit shows another one.
     """
     assert trial.positioning is not None
     section = trial.positioning.section
@@ -392,8 +392,15 @@ def _parameters(trial: Trial) -> tuple[Parameter, ...]:
     for aid in trial.aids:
         for p in aid.parameters():
             reference = aid.section == section and p.stem.endswith(CLOCK_STEMS)
+            if aid.section == section and _is_origin(p):
+                p = replace(p, spec=replace(p.spec, plausible=None))
             out.append(replace(p, sigma=np.zeros_like(p.sigma)) if reference else p)
     return tuple(on_shared_clocks(out, trial.aids))
+
+
+def _is_origin(p: Parameter) -> bool:
+    """Whether it is a lever arm that is stated to be zero for certain."""
+    return p.stem.endswith("lever_arm") and not (p.mean.any() or p.sigma.any())
 
 
 def _start_values(
@@ -578,26 +585,3 @@ def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval
             return np.full(3, _DENSITY)
         squares.append(np.mean((v_b[step:] - v_b[:-step])[alike] ** 2, axis=0))
     return np.asarray(np.maximum(squares[1] / spans[1], 1e-6))
-
-
-def _left_out(trial: Trial) -> list[Finding]:
-    """Name errors that the trial states and that are not estimated without an IMU."""
-    changes = [
-        Finding(
-            Code.ERROR_LEFT_OUT,
-            message("error_left_out.change", section=aid.section, name=key),
-            sensor=aid.label,
-        )
-        for aid in trial.aids
-        for key in aid.settings.left_out
-        if key != "averaging_s"
-    ]
-    return changes + windows_left_out(trial.aids)
-
-
-def _notes(trial: Trial) -> tuple[Finding, ...]:
-    """Return what is left out, for the user."""
-    if trial.find(Ins) is None or trial.find(Attitude) is None:
-        return ()
-    text = message("unused.ins_attitude")
-    return (Finding(Code.UNUSED, text, sensor="INS"),)

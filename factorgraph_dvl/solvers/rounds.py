@@ -24,7 +24,14 @@ from factorgraph_dvl.solvers.averaging import averaging_findings
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_others
 from factorgraph_dvl.solvers.known_parameters import explanation_findings
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.model import Estimated, Model, estimated, minimised, with_all_digits
+from factorgraph_dvl.solvers.model import (
+    Estimated,
+    Model,
+    estimated,
+    least_objective,
+    minimised,
+    with_all_digits,
+)
 from factorgraph_dvl.solvers.preparation import Preparation, Prepared
 from factorgraph_dvl.solvers.steps import (
     Averaging,
@@ -83,6 +90,7 @@ def settle(
     constants_prior: ConstantsPrior | None = None,
     values: dict[str, Array] | None = None,
     clock_zero: float | None = None,
+    roughly: bool = False,
 ) -> SettledMinimum:
     """Return the minimum that some states lead to.
 
@@ -101,6 +109,8 @@ def settle(
         Parameters to start from; by default mountings that fit the motion.
     clock_zero : float, optional
         Reference time of the clock offsets, s; by default in the middle of the trial.
+    roughly : bool, default False
+        Whether another trial starts from there: it asks anew what else the data show.
     """
     start, iterations = _start(prepared, states, report, constants_prior, values, clock_zero)
     at = _first(start, report)
@@ -112,6 +122,10 @@ def settle(
         MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,
         Noise(), ImuNoise(), Uncorrelated(), KnownParametersAgain(known), walks,
     ]  # fmt: skip
+    if roughly:
+        steps = [
+            step for step in steps if isinstance(step, (MotionStrengths, States, GrossErrors))
+        ]
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:
         going_on = False
@@ -216,19 +230,44 @@ def _first(start: Proposal, report: Progress) -> Estimated:
     return replace(found, minimum=replace(found.minimum, iterations=iterations))
 
 
+def _is_hopeless(proposal: Proposal, at: Estimated) -> bool:
+    """Whether noise is so much larger than found that no fit would lower the objective."""
+    model = proposal.model
+    if model.parameters is at.model.parameters or not any(
+        np.any(f > at.model.noise_factors.get(label, f))
+        for label, f in model.noise_factors.items()
+    ):
+        return False
+    at.problem.release()
+    return least_objective(model, proposal.states, proposal.values) > at.objective
+
+
+def _strengths_follow(model: Model, before: Model) -> bool:
+    """Whether strengths of motion and noise are estimated anew: see `MotionStrengths`."""
+    return model.chain.interpolates and not (
+        model.parameters is before.parameters
+        and model.robust_weights is before.robust_weights
+        and [p.label for p in model.processes] == [p.label for p in before.processes]
+    )
+
+
 def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None, int]:
     """Return what a step leads to if the objective is lower there, and the iterations it took."""
-    iterations = 0
+    iterations, last, nearer = 0, np.inf, np.inf
     for proposal in step.proposals(at):
+        # Where less of a change is worse than more of it, none of it is better.
+        if (proposal.nearer and nearer > last) or _is_hopeless(proposal, at):
+            continue
         found = estimated(
             proposal.model,
             proposal.states,
             proposal.values,
             report,
             before=at,
-            rough=proposal.rough,
+            rough=proposal.rough or _strengths_follow(proposal.model, at.model),
         )
         iterations += found.minimum.iterations
+        last, nearer = nearer, found.objective
         if at.rough and proposal.model is at.model:
             return found, iterations
         if found.objective >= at.objective:

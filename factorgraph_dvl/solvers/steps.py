@@ -68,12 +68,15 @@ class Proposal:
         States of the nodes, and values of all parameters.
     rough : bool, default False
         Whether the minimisation may end early, as another one follows.
+    nearer : bool, default False
+        Whether it is on the way to what was proposed before it.
     """
 
     model: Model
     states: Any
     values: dict[str, Array]
     rough: bool = False
+    nearer: bool = False
 
 
 class Step(Protocol):
@@ -135,8 +138,12 @@ class MotionStrengths:
         if found.same:
             self._settled.note(*own)
             self._asked_at = np.inf
-        for share in _SHARES:
+        # Less of what is the same is tried in vain.
+        for share in _SHARES[:1] if found.same else _SHARES:
             yield _with_strengths(model, found, share)
+        # None of them is better: nor will they be at states that are known better.
+        self._settled.note(*own)
+        self._asked_at = np.inf
 
 
 def _with_strengths(model: Model, found: Strengths, share: float) -> Proposal:
@@ -153,7 +160,7 @@ def _with_strengths(model: Model, found: Strengths, share: float) -> Proposal:
         noise_factors=_part_of(model.noise_factors, found.factors, share),
         tilt=found.tilt,
     )
-    return Proposal(changed, found.states, found.values, rough=not found.same)
+    return Proposal(changed, found.states, found.values, rough=not found.same, nearer=share < 1.0)
 
 
 class States:

@@ -51,7 +51,7 @@ def started_from_stretch(
     except (ConfigError, DataError):
         # A sensor may be silent there.
         return prepared
-    settled = settle(part, part.states, report)
+    settled = settle(part, part.states, report, roughly=True)
     if not settled.settled or {p.name for p in part.parameters} != {
         p.name for p in prepared.parameters
     }:
@@ -66,7 +66,7 @@ def started_from_stretch(
     longer = (time[-1] - time[0]) / (time[last[first]] - time[first])
     tilt = found.tilt
     if tilt is not None:
-        # The stretch may estimate others: what it freed, or what its length does not show.
+        # The stretch may estimate others: what its length does not show.
         tilt = tilt.of(found.parameters, [p for p in prepared.parameters if p.estimated])
         tilt = replace(tilt, gradient=longer * tilt.gradient, origin=values, hold=None)
     return replace(

@@ -425,3 +425,15 @@ def test_through_water_standard_deviations_are_those_of_least_squares(monkeypatc
     # Means of a minute lose what turns show: of 10 s, they are 0.8 times as uncertain. The current
     # of one hour may also vary less than that of many, from which the reference takes it.
     assert np.all(found > 0.75 * dense_standard_deviations(trial, scenario, 10.0))
+
+
+@pytest.mark.parametrize(("arm", "origin"), [(0.0, True), (1.0, False)])
+def test_an_antenna_at_the_origin_is_no_parameter_to_be_tested(ship, arm, origin):
+    """Another origin would only make the motion of the body smoother."""
+    gnss = ship.gnss
+    settings = msgspec.structs.replace(
+        gnss.settings, lever_arm_m=(arm, 0.0, 0.0), lever_arm_std_m=(0.0, 0.0, 0.0)
+    )
+    prepared = prepare_without_imu(replace(ship, gnss=replace(gnss, settings=settings)))
+    found = next(p for p in prepared.parameters if p.name == "gnss_lever_arm_m")
+    assert (found.spec.plausible is None) == origin

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import rounds
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
+from factorgraph_dvl.solvers.model import least_objective
 from factorgraph_dvl.solvers.preparation import prepare
 from factorgraph_dvl.solvers.rounds import settle
 from factorgraph_dvl.solvers.steps import Noise
@@ -103,3 +105,53 @@ def test_steps_without_end_are_named(monkeypatch):
     assert not solution.converged
     assert np.isfinite(solution.covariance).all()
     assert of_code(solution.findings, Code.NOT_CONVERGED)
+
+
+def first_minimum(trial):
+    prepared = prepare(trial, 1.0, silent)
+    start, _ = rounds._start(
+        prepared, prepared.start_positions.states[0], silent, None, None, None
+    )
+    return rounds._first(start, silent)
+
+
+def test_noise_that_no_fit_makes_up_for_is_not_tried():
+    at = first_minimum(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1))
+    model = replace(at.model, parameters=(*at.model.parameters[1:], at.model.parameters[0]))
+    wider = {label: 1e3 * f for label, f in model.noise_factors.items()}
+    other = replace(model, noise_factors=wider)
+    assert rounds._is_hopeless(rounds.Proposal(other, at.states, at.values), at)
+    assert not rounds._is_hopeless(rounds.Proposal(model, at.states, at.values), at)
+    least = least_objective(model, at.states, at.values)
+    # What it leaves out: the squares of all residuals.
+    assert least + 2.0 * at.minimum.evaluation.cost == pytest.approx(at.objective, abs=1.0)
+
+
+def test_less_of_what_makes_it_worse_is_not_tried(monkeypatch):
+    tried = []
+
+    def objective(model, *_, **__):
+        tried.append(model.share)
+        minimum = SimpleNamespace(iterations=1, converged=True)
+        return SimpleNamespace(objective=worse[model.share], minimum=minimum, rough=False)
+
+    def model(share):
+        same = {"parameters": (), "robust_weights": {}, "processes": ()}
+        chain = SimpleNamespace(interpolates=True)
+        return SimpleNamespace(share=share, chain=chain, is_applied=lambda _: True, **same)
+
+    class Halved:
+        name = "halved"
+
+        def proposals(self, at):
+            for share in (1.0, 0.5, 0.25, 0.125):
+                yield rounds.Proposal(model(share), None, {}, nearer=share < 1.0)
+
+    monkeypatch.setattr(rounds, "estimated", objective)
+    at = SimpleNamespace(objective=0.0, rough=False, model=model(0.0), problem=None)
+    worse = {1.0: 2.0, 0.5: 4.0, 0.25: 6.0, 0.125: 7.0}
+    assert rounds._kept(Halved(), at, silent) == (None, 2)
+    assert tried == [1.0, 0.5]
+    worse = {1.0: 9.0, 0.5: 4.0, 0.25: 1.0, 0.125: -1.0}
+    found, iterations = rounds._kept(Halved(), at, silent)
+    assert (found.objective, iterations) == (-1.0, 4)
