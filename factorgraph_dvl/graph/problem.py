@@ -193,8 +193,11 @@ class Problem:
 
     @cached_property
     def clock_keys(self) -> list[int]:
-        """Keys of the clocks that are estimated and move measurements along the chain."""
-        names = {name for bound in self._bound for name in bound.clocks}
+        """Keys of the times that are estimated and move measurements along the chain.
+
+        Clocks, and lengths of windows, which are cut where the samples end.
+        """
+        names = {n for b in self._bound for n in (*b.clocks, b.observation.averaging)}
         return [key for name, key in self._key.items() if name in names]
 
     def prior_values(self) -> dict[str, Array]:

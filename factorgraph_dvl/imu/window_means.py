@@ -76,6 +76,10 @@ class BodyMotion:
         """Return it over lengths (M,), s."""
         return BodyMotion(*(_per_second(each, length) for each in vars(self).values()))
 
+    def times(self, factor: Array) -> BodyMotion:
+        """Return it times factors (M,)."""
+        return BodyMotion(*((each.T * factor).T for each in vars(self).values()))
+
     def plus(self, others: BodyMotion, weight: float, own: float = 1.0) -> BodyMotion:
         """Return a weighed sum with others."""
         pairs = zip(vars(self).values(), vars(others).values(), strict=True)
@@ -156,8 +160,12 @@ def _of_lengths(
     since = np.clip(since, 0.0, inc.dt[middle])
     at = inc.start[middle] + since
     first, last = inc.arcs[inc.arc_of[middle]].T
-    reach = np.minimum(at - inc.start[first], inc.end[last - 1] - at)
+    before, after = at - inc.start[first], inc.end[last - 1] - at
+    reach = np.minimum(before, after)
     halves = [0.5 * np.clip(2.0 * reach, _LEAST * size, size) for size in lengths]
+    # By how much a window that is cut grows as its middle moves away from the end of the samples.
+    nearer = np.where(before < after, 2.0, -2.0)
+    growths = [np.where(2.0 * reach < size, nearer, 0.0) for size in lengths]
     edges = [
         [_inside(inc, at + sign * half, first, last) for sign in (-1.0, 1.0)] for half in halves
     ]
@@ -166,9 +174,9 @@ def _of_lengths(
     for own in _chunks(widest[0][0], widest[1][0], inc.arc_of[middle]):
         run = _Run.of(inc, int(widest[0][0][own].min()), int(widest[1][0][own].max()) + 1)
         now = run.at(middle[own], since[own])
-        for out, half, pair in zip(found, halves, edges, strict=True):
+        for out, pair, growth in zip(found, edges, growths, strict=True):
             ends = [run.at(index[own], after[own]) for index, after in pair]
-            out.append(_windows(run, now, ends, half[own], of_body=of_body))
+            out.append(_windows(run, now, ends, growth[own], of_body=of_body))
     back = np.empty_like(order)
     back[order] = np.arange(order.size)
     return [rows_of(concatenated(parts), back) for parts in found]
@@ -286,18 +294,19 @@ def _steps(
 
 
 def _windows(
-    run: _Run, now: _Point, ends: Sequence[_Point], half: Array, *, of_body: bool
+    run: _Run, now: _Point, ends: Sequence[_Point], growth: Array, *, of_body: bool
 ) -> Windows:
-    """Return windows about points of a run from one end to the other."""
-    length = 2.0 * half
+    """Return windows about points of a run from one end to the other, which grow with time."""
+    # Where the samples end, the least window is cut.
+    length = ends[1].time - ends[0].time
     here = now.signals.omega
     step = float(np.mean(run.inc.dt))
-    mean, change, lengthened = (_in_body if of_body else _in_n)(now, ends, half)
+    mean, change, lengthened = (_in_body if of_body else _in_n)(now, ends, length)
     gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
     return Windows(
         mean,
-        change.over(length),
-        lengthened.over(length),
+        change.plus(lengthened.times(growth), 1.0).over(length),
+        lengthened.times(growth == 0.0).over(length),
         BodyMotion(
             -skew(here),
             np.broadcast_to(IDENTITY, now.dR.shape),
@@ -311,13 +320,13 @@ def _windows(
 
 
 def _in_body(
-    now: _Point, ends: Sequence[_Point], half: Array
+    now: _Point, ends: Sequence[_Point], length: Array
 ) -> tuple[BodyMotion, BodyMotion, BodyMotion]:
     """Return the mean in body axes, and its derivatives by time and length, times the length."""
     one, other = ends
     here = now.signals.omega
     back, moment, moved, angle = (
-        _per_second(b - a, 2.0 * half)
+        _per_second(b - a, length)
         for a, b in zip(one.integrals[:4], other.integrals[:4], strict=True)
     )
     # By the axes and the time in the middle what is by those at the start of the run.
@@ -331,7 +340,7 @@ def _in_body(
 
     def at_end(end: _Point, sign: float) -> BodyMotion:
         turn = end.dR.transpose(0, 2, 1) @ now.dR
-        swept = (sign * half)[:, None, None] * turn
+        swept = (sign * 0.5 * length)[:, None, None] * turn
         added = rotate(end.dR.transpose(0, 2, 1), end.dV - now.dV)
         return BodyMotion(turn, swept, added, end.rate - here)
 
@@ -341,7 +350,7 @@ def _in_body(
 
 
 def _in_n(
-    now: _Point, ends: Sequence[_Point], half: Array
+    now: _Point, ends: Sequence[_Point], length: Array
 ) -> tuple[BodyMotion, BodyMotion, BodyMotion]:
     """Return the same of the mean in n, in the axes in the middle.
 
@@ -349,7 +358,7 @@ def _in_n(
     [w x] = (E - E') / length the part that is skew. What is symmetric is of third order.
     """
     one, other = ends
-    here, length = now.signals.omega, 2.0 * half
+    here = now.signals.omega
     bRs = now.dR.transpose(0, 2, 1)
     gained = _per_second(other.integrals[4] - one.integrals[4], length)
     added = rotate(bRs, gained - now.dV)

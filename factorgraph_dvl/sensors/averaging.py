@@ -13,20 +13,23 @@ from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 
 # What the stamp of a mean is the time of.
 Stamp = Literal["start", "middle", "end"]
-# Plausible length, s. Chosen: what instruments average over where nothing else is set.
+# Plausible length, s, of windows of instruments where nothing else is set. Chosen.
 _USUAL_S = 0.3
 _MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 
 
-def averaging_spec(prefix: str = "") -> ParameterSpec:
+def averaging_spec(prefix: str = "", plausible: float = _USUAL_S) -> ParameterSpec:
     """Return what the length of a window is; `prefix` is that of its name."""
-    return ParameterSpec(
-        f"{prefix}averaging", "s", labels=SCALAR, nuisance=True, plausible=_USUAL_S, usual=True
-    )
+    return usual_spec(f"{prefix}averaging", plausible)
 
 
-def window_length(spec: ParameterSpec, length: float, std: float | UnsetType) -> Parameter:
-    """Return the length of a window.
+def usual_spec(stem: str, plausible: float) -> ParameterSpec:
+    """Return what a time is that sensors have although trials do not state it, above zero."""
+    return ParameterSpec(stem, "s", labels=SCALAR, nuisance=True, plausible=plausible, usual=True)
+
+
+def usual_parameter(spec: ParameterSpec, length: float, std: float | UnsetType) -> Parameter:
+    """Return the length of a window, or another time that sensors usually have.
 
     Where its standard deviation is stated, tests leave it as it is.
     """

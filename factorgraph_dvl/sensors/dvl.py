@@ -20,7 +20,7 @@ from factorgraph_dvl.sensors.averaging import (
     Stamp,
     averaging_spec,
     stamp_in_the_middle,
-    window_length,
+    usual_parameter,
 )
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
 from factorgraph_dvl.sensors.dvl_distortion import (
@@ -285,7 +285,7 @@ class Dvl:
             Parameter(LEVER_ARM_SPEC, np.array(s.lever_arm_m), np.array(s.lever_arm_std_m)),
             Parameter(BIAS_SPEC, np.zeros(3), np.array(s.bias_std_m_s)),
             *CLOCK.parameters(s),
-            window_length(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
+            usual_parameter(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
             *(
                 Parameter(spec, np.zeros(spec.size), stated.get(spec.name, np.zeros(spec.size)))

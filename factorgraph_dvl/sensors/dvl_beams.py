@@ -19,7 +19,7 @@ from factorgraph_dvl.sensors.averaging import (
     Stamp,
     averaging_spec,
     stamp_in_the_middle,
-    window_length,
+    usual_parameter,
 )
 from factorgraph_dvl.sensors.beam_model import CommonGeometry, FreeGeometry, Geometry
 from factorgraph_dvl.sensors.clock import Clock, ClockSection
@@ -276,7 +276,7 @@ class DvlBeams:
     def parameters(self) -> tuple[Parameter, ...]:
         """Return directions or misalignment, scale errors, lever arm, clock and window."""
         clock = self.clock.parameters(self.settings)
-        return (*self.mounting_parameters(), *clock, self.window_length)
+        return (*self.mounting_parameters(), *clock, self.usual_parameter)
 
     def mounting_parameters(self) -> tuple[Parameter, Parameter, Parameter]:
         """Return directions or misalignment, scale errors and lever arm."""
@@ -321,11 +321,11 @@ class DvlBeams:
         return _OWN_CLOCK if self.prefix else CLOCK
 
     @property
-    def window_length(self) -> Parameter:
+    def usual_parameter(self) -> Parameter:
         """Length of the window over which the instrument averages."""
         s = self.settings
         spec = _OWN_AVERAGING if self.prefix else AVERAGING_SPEC
-        return window_length(spec, s.averaging_s, s.averaging_std_s)
+        return usual_parameter(spec, s.averaging_s, s.averaging_std_s)
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return the pings at which at least one beam was not lost."""
@@ -351,7 +351,7 @@ class DvlBeams:
                 geometry,
                 lever_arm,
                 self.clock,
-                self.window_length.name,
+                self.usual_parameter.name,
             ),
         )
 

@@ -16,9 +16,10 @@ from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.units import DEG, GEODETIC_SI
 from factorgraph_dvl.geometry.vectors import IDENTITY, Array
 from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.sensors.averaging import averaging_spec, usual_parameter, usual_spec
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
 from factorgraph_dvl.sensors.clock import Clock, ClockSection, LateClock
-from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
+from factorgraph_dvl.sensors.parameters import Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     USUAL_CORRELATION_TIME,
     Motion,
@@ -56,10 +57,10 @@ _VELOCITY_TIME = 2.0
 _AT_REST = np.zeros(3)
 _AT_REST.setflags(write=False)
 _CLOCK = Clock.of("gnss", prefix="gnss_")
-# No test asks for it: positions of an INS that fall back in turns look like a delay of velocities.
-_DELAY = ParameterSpec("gnss_velocity_delay", "s", labels=SCALAR, nuisance=True)
-# Nor for this one: other sensors have no window that is a whole second.
-_AVERAGING = ParameterSpec("gnss_velocity_averaging", "s", labels=SCALAR, nuisance=True)
+# Plausible lengths, s, of windows of velocities, and delays. Chosen: differences of positions over
+# one second, with their stamps at the end.
+_DELAY = usual_spec("gnss_velocity_delay", 0.5)
+_AVERAGING = averaging_spec("gnss_velocity_", 1.0)
 _VELOCITY_CLOCK = LateClock(_CLOCK.offset, _CLOCK.rate, _DELAY)
 TIME_OFFSET = _CLOCK.offset.name
 
@@ -85,15 +86,16 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
     velocity_correlation_time_s: Positive | UnsetType = UNSET
     correlated_velocity_std_m_s: Sigma3 | UnsetType = UNSET
     velocity_delay_s: float = 0.0
-    velocity_delay_std_s: NonNegative = 0.0
+    velocity_delay_std_s: NonNegative | UnsetType = UNSET
     velocity_averaging_s: NonNegative = 0.0
-    velocity_averaging_std_s: NonNegative = 0.0
+    velocity_averaging_std_s: NonNegative | UnsetType = UNSET
 
     @property
     def velocity_lag_s(self) -> tuple[float, float]:
         """What stamps of velocities are late by, and its standard deviation, s."""
-        std = math.hypot(self.time_offset_std_s, self.velocity_delay_std_s)
-        return self.time_offset_s + self.velocity_delay_s, std
+        std = self.velocity_delay_std_s
+        total = math.hypot(self.time_offset_std_s, 0.0 if isinstance(std, UnsetType) else std)
+        return self.time_offset_s + self.velocity_delay_s, total
 
 
 @dataclass(frozen=True)
@@ -229,16 +231,12 @@ class Gnss:
     def of_one_clock(self) -> tuple[Self, ...]:
         """Return positions and velocities apart where these are late beside them, else itself."""
         s = self.settings
-        if s.velocity_delay_s == 0.0 and s.velocity_delay_std_s == 0.0:
+        if s.velocity_delay_s == 0.0 and s.velocity_delay_std_s in {0.0, UNSET}:
             return (self,)
         absent = np.full_like(self.geodetic, np.nan)
         parts = replace(self, velocity=absent), replace(self, geodetic=absent)
         measured = [np.logical_not(part.missing) for part in parts]
         return tuple(rows_of(p, m) for p, m in zip(parts, measured, strict=True) if m.any())
-
-    @property
-    def _averages(self) -> bool:
-        return self.settings.velocity_averaging_s + self.settings.velocity_averaging_std_s > 0.0
 
     def carrier(self, time: Array) -> tuple[Array, Array]:
         """Return bRc (M, 3, 3), axes of what carries the antenna to body, and omega_cb_b (M, 3).
@@ -268,7 +266,7 @@ class Gnss:
         return (
             lever_arm,
             *_CLOCK.parameters(s),
-            *(Parameter(spec, np.array([x]), np.array([std])) for spec, x, std in of_velocity),
+            *(usual_parameter(*each) for each in of_velocity),
         )
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
@@ -322,7 +320,7 @@ class Gnss:
                     bRc=bRc,
                     omega_cb_b=omega_cb_b,
                     noise_groups=HORIZONTAL_AND_UP,
-                    averaging=_AVERAGING.name if self._averages else None,
+                    averaging=_AVERAGING.name,
                     averages_in_body=False,
                     correlated=expected_correlation(
                         s.velocity_correlation_time_s,

@@ -122,9 +122,12 @@ def simulate_gnss(
         nRs = rotation_from_rph(state.rph, scenario.body_axes)
         return state.v_n + apply(nRs, np.cross(state.omega_eb_b, truth.lever_arm_m))
 
-    half = 0.5 * truth.velocity_averaging_s
-    middle = np.clip(time - truth.velocity_delay_s, half, motion.duration - half)
-    velocity = mean_over(velocity_at, motion, middle, truth.velocity_averaging_s)
+    length = truth.velocity_averaging_s
+    # The motion before the start and after the end is not known.
+    middle = middles(time - truth.velocity_delay_s, motion, length)
+    moving = np.isin(time - truth.velocity_delay_s, middle)
+    velocity = np.full((time.size, 3), np.nan)
+    velocity[moving] = mean_over(velocity_at, motion, middle, length)
     white = position_rng.standard_normal(arm_n.shape) * truth.position_std_m
     error = np.sqrt(1.0 - truth.correlated_share) * white
     geodetic = displaced(position, arm_n + error if scenario.noise else arm_n)

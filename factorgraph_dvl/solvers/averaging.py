@@ -1,4 +1,4 @@
-"""Sensors that average over a window although they are stated to measure in no time."""
+"""Sensors that average over a window, or are late, although they are stated not to be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.observation_rows import ObservationRows
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -23,7 +23,9 @@ from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 # twenty is beyond, and loses some precision; one that does is left with less than two standard
 # deviations.
 _SHOWN = 2.7
-# Measurements that are tested, and in how many stretches. Chosen: a third of a second of work.
+# Time between the slopes that show a curvature, s. Chosen: no window is shorter.
+_BETWEEN = 0.1
+# Measurements that are tested, and in how many stretches. Chosen: a tenth of a second of work.
 _ENOUGH, _STRETCHES = 5000, 20
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
@@ -32,10 +34,11 @@ _CERTAIN = 3.0
 
 
 def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
-    """Return the lengths of windows that are taken as known and that the data contradict.
+    """Return lengths of windows, or delays, that the data contradict.
 
-    None where another parameter of the sensor that is taken as known, as its clock, explains more,
-    or where the window leaves most of a misfit: then the cause is another one.
+    Of those that are taken as known. None where another parameter of the sensor that is taken as
+    known, as its clock, explains more, or where most of a misfit is left: then the cause is
+    another one.
 
     Parameters
     ----------
@@ -47,23 +50,25 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         for p in problem.all_parameters
         if not (p.estimated or p.spec.plausible is None or p.spec.of_record)
     }
-    out = []
+    out: dict[str, Parameter] = {}
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
-        p = known.get(_length(bound))
-        if p is None or not p.spec.usual or not bound.weight.any():
+        observation = bound.observation
+        own = [name for name in parameters_of(observation) if name in known]
+        usual = observation.clock is not None and any(known[name].spec.usual for name in own)
+        if not usual or not bound.weight.any():
             continue
-        own = [name for name in parameters_of(bound.observation) if name in known]
         tests = _scores(problem, bound, minimum, own)
-        if tests.score[tests.places[p.name]][0] <= 0.0:
-            continue
         share = len(residual) / _some_of(len(residual)).size
         found = {name: share * tests.test(name).chi2 for name in own}
-        fall = found[p.name]
+        # A clock and a delay beside it do the same to a record: the clock is what is stated.
+        cause = max(own, key=lambda name: (found[name], known[name].spec.usual))
+        if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
+            continue
+        fall = found[cause]
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        most = max(_SHARE * _misfit(bound, residual), *found.values())
-        if fall > _SHOWN * scatter and fall >= most:
-            out.append(p)
-    return tuple(out)
+        if fall > _SHOWN * scatter and fall >= _SHARE * _misfit(bound, residual):
+            out[cause] = known[cause]
+    return tuple(out.values())
 
 
 def _misfit(bound: BoundObservation, residual: Array) -> float:
@@ -91,20 +96,22 @@ def _some_of(count: int) -> IntArray:
 
 
 def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Finding, ...]:
-    """Return findings of the lengths that are estimated although they were stated as known."""
+    """Return findings of the times that are estimated although they were stated as known."""
     known = {p.name for p in stated if not p.estimated}
-    lengths = {p.name: p for p in at.problem.parameters if p.spec.usual and p.name in known}
+    found = {p.name: p for p in at.problem.parameters if p.spec.usual and p.name in known}
     out = []
     for bound in at.problem.bound:
-        p = lengths.get(_length(bound))
-        if p is None:
-            continue
-        P = at.minimum.information.covariance_of([{at.problem.key(p.name): np.eye(1)}])
-        length, std = float(at.values[p.name][0]), float(np.sqrt(P[0, 0]))
-        if length > _CERTAIN * std:
-            label = bound.observation.label
-            text = message("averaging.found", sensor=label, length=length, std=std)
-            out.append(Finding(Code.AVERAGING, text, sensor=label, parameter=p.name))
+        for name in parameters_of(bound.observation):
+            p = found.get(name)
+            if p is None:
+                continue
+            P = at.minimum.information.covariance_of([{at.problem.key(name): np.eye(1)}])
+            length, std = float(at.values[name][0]), float(np.sqrt(P[0, 0]))
+            if length > _CERTAIN * std:
+                label = bound.observation.label
+                key = "averaging.found" if name == _length(bound) else "averaging.late"
+                text = message(key, sensor=label, length=length, std=std)
+                out.append(Finding(Code.AVERAGING, text, sensor=label, parameter=name))
     return tuple(out)
 
 
@@ -118,18 +125,41 @@ def _scores(
 ) -> RecordScores:
     """Return the scores of known parameters, the length of the window among them, of a record.
 
-    Of many measurements, some.
+    Of many measurements, some. The square of the length stands in its place: it has a slope at 0.
     """
     evaluation = minimum.evaluation
     some = _some_of(bound.observation.time.size)
-    window = replace(
+    part = replace(
         bound,
         observation=ObservationRows(bound.observation, some),
         attachment=None,
         usable=bound.usable[some],
         weight=bound.weight[some],
-        averages=True,
     )
-    window.attach(evaluation.parameters)
+    part.attach(evaluation.parameters)
     information = minimum.square_root or factorized(problem, evaluation)[0]
-    return record_scores(problem, window, evaluation, information, known)
+    squares = {
+        name: by_square(problem, part, evaluation) for name in known if name == _length(bound)
+    }
+    return record_scores(problem, part, evaluation, information, known, derivatives=squares)
+
+
+def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
+    """Return derivatives (M, d, 1) of measurements by the square of the length of a window, 1/s².
+
+    Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt². The slope
+    of ρ at both ends of a short window is that by a clock.
+    """
+    values, chain, clock = evaluation.parameters, bound.chain, bound.observation.clock
+    assert clock is not None
+    offset, time = clock.names[0], bound.times(values)
+    slopes, covered = [], np.ones(time.size, dtype=bool)
+    for sign in (-0.5, 0.5):
+        when = time + sign * _BETWEEN
+        motion = bound.motion(chain.attach(when, chain.shift(values)), evaluation.states, values)
+        lin = bound.linearized(motion, values, [offset], problem.processes_of(bound))
+        slopes.append(-lin.d_parameters[offset])
+        covered &= chain.covers(when)
+    out = (slopes[1] - slopes[0]) / (24.0 * _BETWEEN)
+    out[~covered] = 0.0
+    return out

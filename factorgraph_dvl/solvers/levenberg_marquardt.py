@@ -351,7 +351,8 @@ class _Search:
         if self.damping == 0.0 and self.fixed and self.promised < _WITHIN:
             return _End.FIXED
         if self.damping == 0.0 and self._is_proven and self._is_within(delta):
-            return _End.MINIMUM
+            # The information of fixed clocks is none.
+            return _End.FIXED if self.fixed else _End.MINIMUM
         if not self.careful and self.root is None:
             # The step may have been bad for want of digits only.
             self.careful = True

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from types import MappingProxyType
 
 import numpy as np
 
@@ -72,6 +73,7 @@ def record_scores(
     information: SquareRootInformation,
     names: Sequence[str],
     motion: Motion | None = None,
+    derivatives: Mapping[str, Array] = MappingProxyType({}),
 ) -> RecordScores:
     """Return scores and information of parameters that change one record only.
 
@@ -96,6 +98,8 @@ def record_scores(
         The parameters.
     motion : Motion, optional
         Motion where the observation is attached, if it is known.
+    derivatives : mapping of str to ndarray, optional
+        Derivatives (M, d, n) by some of the parameters, in place of those of the observation.
     """
     values = evaluation.parameters
     if motion is None:
@@ -103,6 +107,7 @@ def record_scores(
     own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
     wanted = [p.name for p in own]
     lin = bound.linearized(motion, values, [*wanted, *names], processes)
+    lin.d_parameters.update(derivatives)
     edges = np.cumsum([0, *(lin.d_parameters[name].shape[2] for name in names)]).tolist()
     keys = bound.keys_at(bound.nodes(processes), processes, [problem.key(n) for n in wanted])
     sizes = tuple(bound.sizes(processes, own))

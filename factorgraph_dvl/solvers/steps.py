@@ -203,6 +203,7 @@ class Averaging:
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
+        # From a length of zero, so that all measurements count as before.
         yield Proposal(_with_others(at, *(wide(p, p.mean) for p in found)), at.states, at.values)
 
 

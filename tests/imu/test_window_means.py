@@ -160,3 +160,23 @@ def test_derivatives_are_those_of_the_value_where_samples_are_noisy(length):
             change = (getattr(ahead, value) - getattr(behind, value)) / (2.0 * h)
             size = np.abs(change).max()
             np.testing.assert_allclose(getattr(found, by_length), change, atol=2e-3 * size)
+
+
+@pytest.mark.parametrize("of_body", [True, False])
+@pytest.mark.parametrize("length", [0.0, SHORTEST, 1.0])
+def test_where_the_samples_end_a_window_is_cut(moving, length, of_body):
+    """At the last sample hardly anything is left; 0.2 s before, the rest about the time."""
+    end = moving[0].segments.increments.end[-1]
+    at = np.array([end, end - 0.2])
+    found = motion(moving, at, length, of_body=of_body)
+    rest = motion(moving, at, min(length, 0.4), of_body=of_body)
+    np.testing.assert_allclose(found.v_n[0], motion(moving, at).v_n[0], atol=3e-3)
+    np.testing.assert_allclose(found.v_n[1], rest.v_n[1], atol=1e-6)
+    # It does not grow with its length, and does with the time to the end.
+    if length > 0.4:
+        np.testing.assert_array_equal(found.mean.v_by_length, 0.0)
+        step = 1e-3
+        later, earlier = (
+            motion(moving, at[1:] + s, length, of_body=of_body).v_n[0] for s in (step, -step)
+        )
+        np.testing.assert_allclose(found.a_n[1], (later - earlier) / (2.0 * step), atol=2e-3)

@@ -1,4 +1,4 @@
-"""A DVL that averages: stated, found, or not there."""
+"""A DVL, or velocities of GNSS, that average: stated, found, or not there."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ import pytest
 import yaml
 from monte_carlo import RUNS
 from scipy.stats import chi2
-from truth import CONFIGS
+from truth import CONFIGS, scenario
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
-from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.averaging import by_square
+from factorgraph_dvl.solvers.batch import solve, solved_problems
 
 MOUNT = (
     *(f"misalignment_{axis}_deg" for axis in "xyz"),
@@ -43,8 +44,12 @@ def trial_of(length_s, seed, **claims):
 
 
 def mount_nees(solution, trial):
+    return nees_of(solution, trial, MOUNT)
+
+
+def nees_of(solution, trial, names):
     errors = calibration_errors(solution, trial.calibration_truth)
-    rows = [errors.names.index(name) for name in MOUNT]
+    rows = [errors.names.index(name) for name in names]
     P = errors.covariance[np.ix_(rows, rows)]
     return float(errors.error[rows] @ np.linalg.solve(P, errors.error[rows]))
 
@@ -121,6 +126,93 @@ def test_single_beams_average_too():
     assert abs(length.value[0] - 0.5) < 4.0 * length.std[0] < 0.2
     assert np.all(np.abs(arm.value - [1.0, 1.2, 1.4]) < 4.0 * arm.std)
     assert np.all(arm.std < 0.02)
+
+
+ANTENNA = tuple(f"gnss_lever_arm_{axis}_m" for axis in "xyz")
+SEA = {
+    "roll": [{"amplitude_deg": 6, "frequency_hz": 0.15}],
+    "pitch": [{"amplitude_deg": 3, "frequency_hz": 0.2, "phase_deg": 60}],
+    "heave": [{"amplitude_m": 0.3, "frequency_hz": 0.17}],
+}
+
+
+def trial_of_gnss(length_s, delay_s, seed, **claims):
+    """Return a trial in a seaway whose GNSS velocities are means, six metres above the IMU."""
+    gnss = {
+        "velocity_averaging_s": length_s,
+        "velocity_delay_s": delay_s,
+        "velocity_std_m_s": [0.02] * 3,
+        "lever_arm_m": [0.5, -2.0, 6.0],
+        "rate_hz": 1,
+    }
+    claims = {"gnss": {"lever_arm_std_m": [0.1] * 3, **claims}}
+    return simulate(scenario(noise=True, sway=SEA, gnss=gnss, trial=claims), seed)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.5])
+def test_a_window_of_gnss_velocities_that_is_not_stated_is_found(delay_s):
+    trial = trial_of_gnss(1.0, delay_s, 4, time_offset_std_s=0.5)
+    found = solve(trial, rate_hz=1.0)
+    expected = {"gnss_velocity_averaging_s": 1.0, "gnss_velocity_delay_s": delay_s}
+    for name, value in expected.items():
+        if value:
+            e = found.estimate(name)
+            assert abs(e.value[0] - value) < 4.0 * e.std[0] < 0.4
+        else:
+            assert name not in found.order
+    assert nees_of(found, trial, ANTENNA) < chi2.ppf(0.999, 3)
+    named = {f.parameter for f in found.findings if f.code == Code.AVERAGING}
+    assert named == {name for name, value in expected.items() if value}
+    assert found.verdict.grade == "good"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [False, True])
+@pytest.mark.parametrize("length_s", [0.0, 0.5, 1.0, 2.0])
+def test_standard_deviations_hold_whatever_the_window_of_gnss(length_s, late):
+    """Without the window, the antenna is 9 sigma off in height after 1 s, and 25 after 2 s."""
+    delay_s = 0.5 * length_s if late else 0.0
+    truth = {"gnss_velocity_averaging_s": length_s, "gnss_velocity_delay_s": delay_s}
+    nees, of_antenna, of_times = [], [], []
+    for seed in range(RUNS):
+        trial = trial_of_gnss(length_s, delay_s, seed)
+        found = solve(trial, rate_hz=1.0)
+        nees.append(mount_nees(found, trial))
+        of_antenna.append(nees_of(found, trial, ANTENNA))
+        times = [found.estimate(name) for name in truth if name in found.order]
+        of_times += [((e.value[0] - truth[e.name]) / e.std[0]) ** 2 for e in times]
+        if length_s >= 1.0:
+            assert len(times) == 1 + late
+    for squares, freedom in ((nees, 7), (of_antenna, 3)):
+        low, high = chi2.ppf([0.005, 0.995], freedom * RUNS)
+        assert low < sum(squares) < high, np.round(np.array(squares) / freedom, 2)
+    if length_s >= 1.0:
+        assert sum(of_times) < chi2.ppf(0.995, len(of_times)), np.round(of_times, 1)
+
+
+def test_the_square_of_a_window_changes_what_is_predicted_as_the_window_does():
+    trial = trial_of_gnss(0.0, 0.0, 1)
+    solved, *_ = solved_problems(trial)
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    checked = 0
+    for bound in problem.bound:
+        name = bound.observation.averaging
+        if name is None:
+            continue
+        own = problem.processes_of(bound)
+        means = []
+        for length in (0.0, 0.3):
+            values = evaluation.parameters | {name: np.array([length])}
+            there = bound.motion(bound.attached(values), evaluation.states, values)
+            means.append(bound.residual(there, values, own))
+        inside = slice(2, -2)
+        found = by_square(problem, bound, evaluation)[inside, :, 0]
+        expected = ((means[1] - means[0]) / 0.3**2)[inside]
+        # Of noise, both have a share of their own; of a mean in n, products of rates are left out.
+        assert np.vdot(found, expected) == pytest.approx(np.vdot(expected, expected), rel=0.04)
+        assert np.linalg.norm(found - expected) < 0.2 * np.linalg.norm(expected)
+        checked += 1
+    assert checked == 2
 
 
 def test_a_window_that_is_left_out_is_said_of_single_beams_too():

@@ -47,9 +47,10 @@ def test_a_velocity_is_late_beside_its_position_by_hand():
 
 
 @pytest.mark.slow
-def test_a_late_velocity_is_estimated_where_that_is_stated():
+@pytest.mark.parametrize("stated", [False, True])
+def test_a_late_velocity_is_estimated(stated):
     """Differences of positions over a second are half a second late."""
-    claims = {"velocity_delay_s": 0.4, "velocity_delay_std_s": 0.2}
+    claims = {"velocity_delay_s": 0.4, "velocity_delay_std_s": 0.2} if stated else {}
     gnss = {**GNSS, "velocity_delay_s": 0.5}
     trial = simulate(scenario(noise=True, gnss=gnss, trial=merged(FREE, {"gnss": claims})), 3)
     solution = solve(trial, rate_hz=1.0)
