@@ -39,7 +39,7 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
         dv=dv_at,
         dp=_cubic(values, *moved),
         force=rotate(exp_so3(-phi_at), _cubic(slopes, dv, force, force_after)),
-        vibration=turning - signals["omega"],
+        rough=turning - signals["omega"],
         moving=_cubic(slopes, *moved) - dv_at,
         **signals,
     )

@@ -65,9 +65,10 @@ class Partial:
         rad/s.
     alpha_sigma, force_sigma : ndarray, shape (M,)
         Standard deviation of alpha and force from noise.
-    vibration, moving : ndarray, shape (M, 3), optional
+    rough, moving : ndarray, shape (M, 3), optional
         Rates at which attitude and position change at the end, less omega and dv, rad/s and m/s:
-        the rate is smoothed, and the increments are those of the samples.
+        the rate is smoothed, and the increments are those of the samples, smooth and rough
+        (Tukey, Exploratory Data Analysis, 1977).
     """
 
     phi: Array
@@ -79,7 +80,7 @@ class Partial:
     omega_sigma: Array
     alpha_sigma: Array
     force_sigma: Array
-    vibration: Array | None = None
+    rough: Array | None = None
     moving: Array | None = None
 
 

@@ -65,7 +65,7 @@ class Attachment:
         Standard deviation of alpha and force from noise.
     turn : ndarray, shape (M, 3, 3)
         Exp(-earth_rate tau).
-    vibration, moving : ndarray, shape (M, 3), optional
+    rough, moving : ndarray, shape (M, 3), optional
         Rates at which attitude and position change, less gyro and dV, rad/s in the axes at the
         time, and m/s in those at the node.
     """
@@ -84,7 +84,7 @@ class Attachment:
     alpha_sigma: Array
     force_sigma: Array
     turn: Array
-    vibration: Array | None = None
+    rough: Array | None = None
     moving: Array | None = None
 
 
@@ -193,7 +193,7 @@ def _attach_some(
         alpha_sigma=part.alpha_sigma,
         force_sigma=part.force_sigma,
         turn=turn,
-        vibration=part.vibration,
+        rough=part.rough,
         moving=None if part.moving is None else rotate(dR, part.moving),
     )
 
@@ -324,7 +324,7 @@ def motion_at(
         a_n=a_n,
         alpha_b=at.alpha,
         omega_sigma=at.omega_sigma,
-        vibration_b=at.vibration,
+        rough_b=at.rough,
         moving_n=None if at.moving is None else rotate(at.turn, rotate(R, at.moving)),
     )
 

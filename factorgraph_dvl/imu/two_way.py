@@ -162,7 +162,7 @@ def carried_back(ends: Integrals, forward: Attachment, place: Attachment) -> Att
         gyro=forward.gyro,
         alpha=forward.alpha,
         force=forward.force,
-        vibration=forward.vibration,
+        rough=forward.rough,
         moving=None if forward.moving is None else rotate(back, forward.moving),
     )
 

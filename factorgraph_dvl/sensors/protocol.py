@@ -70,8 +70,8 @@ class Motion:
         not resolve.
     turning_b : ndarray, shape (M, 3), optional
         Rate at which two attitudes that differ are blended, rad/s.
-    vibration_b : ndarray, shape (M, 3), optional
-        Rate of the attitude that omega_eb_b leaves out, rad/s.
+    rough_b : ndarray, shape (M, 3), optional
+        Rate at which the attitude changes, less omega_eb_b, which is smooth, rad/s.
     moving_n : ndarray, shape (M, 3), optional
         Rate at which the position changes, less v_n, m/s.
     mean : MeanMotion, optional
@@ -86,7 +86,7 @@ class Motion:
     alpha_b: Array
     omega_sigma: Array
     turning_b: Array | None = None
-    vibration_b: Array | None = None
+    rough_b: Array | None = None
     moving_n: Array | None = None
     mean: MeanMotion | None = None
 
@@ -95,7 +95,7 @@ class Motion:
         """Rates at which attitude and position change, (M, 3) each, rad/s in b and m/s in n."""
         if self.mean is not None:
             return self.mean.turn_rate_b, self.mean.move_rate_n
-        turning = [each for each in (self.turning_b, self.vibration_b) if each is not None]
+        turning = [each for each in (self.turning_b, self.rough_b) if each is not None]
         moving = [] if self.moving_n is None else [self.moving_n]
         return sum(turning, self.omega_eb_b), sum(moving, self.v_n)
 
