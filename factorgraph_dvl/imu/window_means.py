@@ -172,11 +172,12 @@ def _of_lengths(
     widest = edges[int(np.argmax(lengths))]
     found: list[list[Windows]] = [[] for _ in lengths]
     for own in _chunks(widest[0][0], widest[1][0], inc.arc_of[middle]):
-        run = _Run.of(inc, int(widest[0][0][own].min()), int(widest[1][0][own].max()) + 1)
+        begin, end = int(widest[0][0][own].min()), int(widest[1][0][own].max()) + 1
+        run = _Run.of(inc, begin, end, of_body=of_body)
         now = run.at(middle[own], since[own])
         for out, pair, growth in zip(found, edges, growths, strict=True):
             ends = [run.at(index[own], after[own]) for index, after in pair]
-            out.append(_windows(run, now, ends, growth[own], of_body=of_body))
+            out.append(_windows(run, now, ends, growth[own]))
     back = np.empty_like(order)
     back[order] = np.arange(order.size)
     return [rows_of(concatenated(parts), back) for parts in found]
@@ -216,7 +217,7 @@ class _Point:
     dV : ndarray, shape (M, 3)
         Integral of the specific force, in the axes at the start.
     integrals : tuple of ndarray
-        Integrals of dRᵀ, of t dRᵀ, of dRᵀ dV, of the rate and of dV.
+        Integrals of dRᵀ, of t dRᵀ, of dRᵀ dV and of the rate; of means in n, of dV alone.
     rate : ndarray, shape (M, 3), rad/s
         Slope of the integral of the rate.
     signals : Partial
@@ -241,9 +242,10 @@ class _Run:
     dR: Array
     dV: Array
     integrals: tuple[Array, ...]
+    of_body: bool
 
     @classmethod
-    def of(cls, inc: Increments, begin: int, end: int) -> _Run:
+    def of(cls, inc: Increments, begin: int, end: int, *, of_body: bool) -> _Run:
         """Return those from the start of an interval to the start of another one."""
         inside = np.arange(begin, end)
         phi, dv = inc.over(inside)
@@ -251,17 +253,20 @@ class _Run:
         dR = cumulative_products(np.concatenate([IDENTITY[None], exp_so3(phi[:-1])]))
         dV = sums_before(rotate(dR, dv))
         dt = inc.dt[inside]
-        steps = _steps(dR, dV, phi, dv, time, dt, cubics_between(inc, inside, dt))
-        return cls(inc, begin, time, dR, dV, tuple(sums_before(each) for each in steps))
+        cubics = cubics_between(inc, inside, dt)
+        steps = _steps(dR, dV, phi, dv, time, dt, cubics, of_body=of_body)
+        sums = tuple(sums_before(each) for each in steps)
+        return cls(inc, begin, time, dR, dV, sums, of_body)
 
     def at(self, index: IntArray, since: Array) -> _Point:
         """Return the motion `since` seconds after the start of intervals `index`."""
         part, k = between_samples(self.inc, index, since), index - self.begin
         dR, dV = self.dR[k], self.dV[k]
         cubics = cubics_between(self.inc, index, since)
-        steps = _steps(dR, dV, part.phi, part.dv, self.time[k], since, cubics)
+        start = self.time[k]
+        steps = _steps(dR, dV, part.phi, part.dv, start, since, cubics, of_body=self.of_body)
         return _Point(
-            self.time[k] + since,
+            start + since,
             dR @ exp_so3(part.phi),
             dV + rotate(dR, part.dv),
             tuple(before[k] + step for before, step in zip(self.integrals, steps, strict=True)),
@@ -271,7 +276,15 @@ class _Run:
 
 
 def _steps(
-    dR: Array, dV: Array, phi: Array, dv: Array, start: Array, h: Array, cubics: Cubics
+    dR: Array,
+    dV: Array,
+    phi: Array,
+    dv: Array,
+    start: Array,
+    h: Array,
+    cubics: Cubics,
+    *,
+    of_body: bool,
 ) -> tuple[Array, ...]:
     """Return what h s, (M,), add to the integrals, with increments phi and dv.
 
@@ -279,6 +292,9 @@ def _steps(
     phi and dv are beyond those of their chords: so the slope of an integral is what is integrated,
     also inside an interval.
     """
+    if not of_body:
+        width = h[:, None]
+        return (dV * width + rotate(dR, 0.5 * dv * width + cubics.velocity),)
     bRt = dR.transpose(0, 2, 1)
     across = skew(phi)
     once = across @ bRt
@@ -289,19 +305,16 @@ def _steps(
     crossed = cross(phi, dv)
     added = (dv / 2.0 - crossed / 3.0 + cross(phi, crossed) / 8.0) * h[:, :, 0]
     added = added + cubics.velocity
-    gained = dV * h[:, :, 0] + rotate(dR, 0.5 * dv * h[:, :, 0] + cubics.velocity)
-    return back, moment, rotate(back, dV) + added, phi, gained
+    return back, moment, rotate(back, dV) + added, phi
 
 
-def _windows(
-    run: _Run, now: _Point, ends: Sequence[_Point], growth: Array, *, of_body: bool
-) -> Windows:
+def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> Windows:
     """Return windows about points of a run from one end to the other, which grow with time."""
     # Where the samples end, the least window is cut.
     length = ends[1].time - ends[0].time
     here = now.signals.omega
     step = float(np.mean(run.inc.dt))
-    mean, change, lengthened = (_in_body if of_body else _in_n)(now, ends, length)
+    mean, change, lengthened = (_in_body if run.of_body else _in_n)(now, ends, length)
     gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
     return Windows(
         mean,
@@ -326,8 +339,7 @@ def _in_body(
     one, other = ends
     here = now.signals.omega
     back, moment, moved, angle = (
-        _per_second(b - a, length)
-        for a, b in zip(one.integrals[:4], other.integrals[:4], strict=True)
+        _per_second(b - a, length) for a, b in zip(one.integrals, other.integrals, strict=True)
     )
     # By the axes and the time in the middle what is by those at the start of the run.
     about = moment - now.time[:, None, None] * back
@@ -360,7 +372,7 @@ def _in_n(
     one, other = ends
     here = now.signals.omega
     bRs = now.dR.transpose(0, 2, 1)
-    gained = _per_second(other.integrals[4] - one.integrals[4], length)
+    gained = _per_second(other.integrals[0] - one.integrals[0], length)
     added = rotate(bRs, gained - now.dV)
     turned = [bRs @ end.dR for end in ends]
     turning = [E @ skew(end.rate) for E, end in zip(turned, ends, strict=True)]

@@ -13,6 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.scale_causes import scale_cause
+from factorgraph_dvl.sensors.averaging import WINDOW_KEY
 from factorgraph_dvl.sensors.protocol import Aid
 
 # Factors by which residuals are larger than stated from which on every standard deviation is too
@@ -293,13 +294,14 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
 
 
 def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
-    """Return findings of windows that sensors state, where each ping counts as instantaneous."""
+    """Return findings of windows that sensors state, where measurements are instantaneous."""
     return [
         Finding(
             Code.ERROR_LEFT_OUT,
-            message("error_left_out.window", section=aid.section),
+            message("error_left_out.window", section=aid.section, name=key),
             sensor=aid.label,
         )
         for aid in aids
-        if "averaging_s" in aid.settings.left_out
+        for key in aid.settings.left_out
+        if key.endswith(WINDOW_KEY)
     ]

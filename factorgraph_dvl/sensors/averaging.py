@@ -15,6 +15,8 @@ from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 Stamp = Literal["start", "middle", "end"]
 # Plausible length, s, of windows of instruments where nothing else is set. Chosen.
 _USUAL_S = 0.3
+# How the keys of windows end.
+WINDOW_KEY = "averaging_s"
 _MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 
 

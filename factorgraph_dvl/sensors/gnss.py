@@ -91,6 +91,11 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
     velocity_averaging_std_s: NonNegative | UnsetType = UNSET
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """The window of velocities, where there is one."""
+        return ("velocity_averaging_s",) if self.velocity_averaging_s > 0.0 else ()
+
+    @property
     def velocity_lag_s(self) -> tuple[float, float]:
         """What stamps of velocities are late by, and its standard deviation, s."""
         std = self.velocity_delay_std_s

@@ -226,3 +226,12 @@ def test_a_window_that_is_left_out_is_said_of_single_beams_too():
     (found,) = windows_left_out(aids)
     assert found.code == Code.ERROR_LEFT_OUT
     assert "dvl_beams.averaging_s" in found.text
+
+
+def test_a_window_of_gnss_that_is_left_out_is_said():
+    trial = trial_of_gnss(0.0, 0.0, 1)
+    assert windows_left_out(trial.aids) == []
+    averaging = trial_of_gnss(0.0, 0.0, 1, velocity_averaging_s=1.0)
+    (found,) = windows_left_out(averaging.aids)
+    assert found.sensor == averaging.gnss.label
+    assert "gnss.velocity_averaging_s" in found.text
