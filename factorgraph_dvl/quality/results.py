@@ -293,15 +293,22 @@ def ambiguity(hypotheses: Sequence[Hypothesis]) -> list[Finding]:
     ]
 
 
+def errors_left_out(aids: Sequence[Aid]) -> list[Finding]:
+    """Return findings of errors that sensors state and that are not estimated without an IMU."""
+    return [_left_out(aid, key) for aid in aids for key in aid.settings.left_out]
+
+
 def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
     """Return findings of windows that sensors state, where measurements are instantaneous."""
-    return [
-        Finding(
-            Code.ERROR_LEFT_OUT,
-            message("error_left_out.window", section=aid.section, name=key),
-            sensor=aid.label,
-        )
-        for aid in aids
-        for key in aid.settings.left_out
-        if key.endswith(WINDOW_KEY)
-    ]
+    windows = [(aid, key) for aid in aids for key in aid.settings.left_out if _is_window(key)]
+    return [_left_out(aid, key) for aid, key in windows]
+
+
+def _left_out(aid: Aid, key: str) -> Finding:
+    told = "error_left_out.window" if _is_window(key) else "error_left_out.change"
+    text = message(told, section=aid.section, name=key)
+    return Finding(Code.ERROR_LEFT_OUT, text, sensor=aid.label)
+
+
+def _is_window(key: str) -> bool:
+    return key.endswith(WINDOW_KEY)

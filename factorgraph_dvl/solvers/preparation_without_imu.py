@@ -28,7 +28,9 @@ from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
-from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.message import message
+from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import errors_left_out
 from factorgraph_dvl.sensors.attitude import Attitude
 from factorgraph_dvl.sensors.clock import CLOCK_STEMS, on_shared_clocks
 from factorgraph_dvl.sensors.ins import Ins
@@ -39,7 +41,6 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
-from factorgraph_dvl.solvers.notes_without_imu import notes_without_imu
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
@@ -253,7 +254,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
             for o in every
             if o.noise_groups and not _followed(o, nodes)
         ),
-        findings=(*trial.notes, *notes_without_imu(trial)),
+        findings=(*trial.notes, *_notes(trial), *errors_left_out(trial.aids)),
     )
 
 
@@ -585,3 +586,11 @@ def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval
             return np.full(3, _DENSITY)
         squares.append(np.mean((v_b[step:] - v_b[:-step])[alike] ** 2, axis=0))
     return np.asarray(np.maximum(squares[1] / spans[1], 1e-6))
+
+
+def _notes(trial: Trial) -> tuple[Finding, ...]:
+    """Name attitudes that another sensor of attitude takes the place of."""
+    if trial.find(Ins) is None or trial.find(Attitude) is None:
+        return ()
+    text = message("unused.ins_attitude")
+    return (Finding(Code.UNUSED, text, sensor="INS"),)
