@@ -163,7 +163,7 @@ def _of_lengths(
     before, after = at - inc.start[first], inc.end[last - 1] - at
     reach = np.minimum(before, after)
     halves = [0.5 * np.clip(2.0 * reach, _LEAST * size, size) for size in lengths]
-    # By how much a window that is cut grows as its middle moves away from the end of the samples.
+    # By how much a window that is cut grows as its middle moves, from the end of the samples on.
     nearer = np.where(before < after, 2.0, -2.0)
     growths = [np.where(2.0 * reach < size, nearer, 0.0) for size in lengths]
     edges = [

@@ -305,8 +305,8 @@ def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
 
 
 def _left_out(aid: Aid, key: str) -> Finding:
-    told = "error_left_out.window" if _is_window(key) else "error_left_out.change"
-    text = message(told, section=aid.section, name=key)
+    key_of_text = "error_left_out.window" if _is_window(key) else "error_left_out.change"
+    text = message(key_of_text, section=aid.section, name=key)
     return Finding(Code.ERROR_LEFT_OUT, text, sensor=aid.label)
 
 
