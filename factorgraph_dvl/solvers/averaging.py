@@ -25,8 +25,8 @@ from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 _SHOWN = 2.7
 # Time between the slopes that show a curvature, s. Chosen: no window is shorter.
 _BETWEEN = 0.1
-# Measurements that are tested, and in how many stretches. Chosen: a tenth of a second of work.
-_ENOUGH, _STRETCHES = 5000, 20
+# Measurements that are tested, and in how many stretches. Chosen: a quarter of a second of work.
+_ENOUGH, _STRETCHES = 10_000, 20
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
 # Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
@@ -58,15 +58,15 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         if not usual or not bound.weight.any():
             continue
         tests = _scores(problem, bound, minimum, own)
-        share = len(residual) / _some_of(len(residual)).size
-        found = {name: share * tests.test(name).chi2 for name in own}
+        found = {name: tests.test(name).chi2 for name in own}
         # A clock and a delay beside it do the same to a record: the clock is what is stated.
         cause = max(own, key=lambda name: (found[name], known[name].spec.usual))
         if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
             continue
-        fall = found[cause]
+        share = len(residual) / _some_of(len(residual)).size
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        if fall > _SHOWN * scatter and fall >= _SHARE * _misfit(bound, residual):
+        explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
+        if found[cause] > _SHOWN * scatter and explains:
             out[cause] = known[cause]
     return tuple(out.values())
 
