@@ -19,10 +19,10 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 
-# χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in a
-# hundred is beyond, and takes another solution; one that does is left with a few standard
+# χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
+# twenty is beyond, and loses some precision; one that does is left with less than two standard
 # deviations.
-_SHOWN = 5.4
+_SHOWN = 2.7
 # Time between the slopes that show a curvature, s. Chosen: no window is shorter.
 _BETWEEN = 0.1
 # Measurements that are tested, and in how many stretches. Chosen: a quarter of a second of work.
