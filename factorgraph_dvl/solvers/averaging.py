@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import ndtri
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
@@ -19,10 +20,9 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 
-# χ² of a length from which on it is estimated. Chosen: of sensors that do not average, one in
-# twenty is beyond, and loses some precision; one that does is left with less than two standard
-# deviations.
-_SHOWN = 2.7
+# Share of the sensors that neither average nor are late of which one is tried all the same.
+# Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
+_BY_CHANCE = 0.05
 # Time between the slopes that show a curvature, s. Chosen: no window is shorter.
 _BETWEEN = 0.1
 # Measurements that are tested, and in how many stretches. Chosen: a quarter of a second of work.
@@ -54,8 +54,8 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         observation = bound.observation
         own = [name for name in parameters_of(observation) if name in known]
-        usual = observation.clock is not None and any(known[name].spec.usual for name in own)
-        if not usual or not bound.weight.any():
+        usual = sum(known[name].spec.usual for name in own)
+        if observation.clock is None or not usual or not bound.weight.any():
             continue
         tests = _scores(problem, bound, minimum, own)
         found = {name: tests.test(name).chi2 for name in own}
@@ -66,7 +66,9 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         share = len(residual) / _some_of(len(residual)).size
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
         explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
-        if found[cause] > _SHOWN * scatter and explains:
+        # One-sided: lengths are above zero.
+        shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
+        if found[cause] > shown * scatter and explains:
             out[cause] = known[cause]
     return tuple(out.values())
 
@@ -107,7 +109,9 @@ def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Find
                 continue
             P = at.minimum.information.covariance_of([{at.problem.key(name): np.eye(1)}])
             length, std = float(at.values[name][0]), float(np.sqrt(P[0, 0]))
-            if length > _CERTAIN * std:
+            # The data show the square of a window: its relative error is twice that of the length.
+            certain = _CERTAIN * (2.0 if name == _length(bound) else 1.0)
+            if length > certain * std:
                 label = bound.observation.label
                 key = "averaging.found" if name == _length(bound) else "averaging.late"
                 text = message(key, sensor=label, length=length, std=std)
