@@ -78,7 +78,7 @@ def calibrate_beams(trial: Trial, *, rate_hz: float, report: Progress) -> tuple[
     outcome = replace(outcome, estimated=without_spurious_information(pings, outcome.estimated))
     residual, sigma = beam_residuals(pings, outcome.estimated)
     components = tuple(f"beam {i}" for i in range(1, residual.shape[1] + 1))
-    findings = [*navigation.findings, treated_as_white()]
+    findings = [*navigation.findings, treated_as_white(outcome.estimated)]
     findings += left_out(sensor, int(np.sum(received & ~covered)), int(np.sum(covered & ~used)))
     solution = summarise(
         trial,

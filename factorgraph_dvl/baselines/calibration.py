@@ -15,7 +15,7 @@ from factorgraph_dvl.baselines.least_squares import least_squares
 from factorgraph_dvl.baselines.luo_2024 import as_printed
 from factorgraph_dvl.baselines.navigation import Navigation, attitude_is_known, navigate
 from factorgraph_dvl.baselines.nine_state import nine_state, unscented, with_bias
-from factorgraph_dvl.baselines.outcome import Estimated, History, Outcome, history_of
+from factorgraph_dvl.baselines.outcome import History, Outcome, history_of
 from factorgraph_dvl.baselines.point_set_filter import point_set
 from factorgraph_dvl.baselines.point_sets import Points
 from factorgraph_dvl.baselines.recorded_navigation import (
@@ -40,7 +40,6 @@ from factorgraph_dvl.baselines.three_points import three_points
 from factorgraph_dvl.baselines.wahba import wahba
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, rph_from_rotation
-from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.imu.timestamps import JUMP, without_restarted_clock
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -239,13 +238,14 @@ def _calibrate_dvl(
     outcome = replace(
         outcome, estimated=without_spurious_information(points, outcome.estimated, arm)
     )
+    lasting = neglected_by(points, navigation.at(points.time), outcome.estimated, arm)
     joint = [_UNCORRELATED] if dvl.prior is not None else []
     findings = [
         *navigation.findings,
         *_outage(trial),
         *joint,
         *outcome.findings,
-        _treated_as_white(navigation, points, outcome.estimated, arm),
+        treated_as_white(outcome.estimated, lasting),
         *_neglects(method, dvl),
         *left_out(dvl, *unused),
     ]
@@ -261,15 +261,6 @@ def _calibrate_dvl(
         findings=findings,
     )
     return solution, history_of(outcome)
-
-
-def _treated_as_white(
-    navigation: Navigation | RecordedNavigation, points: Points, estimated: Estimated, arm: Array
-) -> Finding:
-    """Say what it does to standard deviations that errors of the motion count as white noise."""
-    names = [name for p in estimated.parameters for name in p.component_names]
-    motion = navigation.at(points.time)
-    return treated_as_white(names, neglected_by(points, motion, estimated, arm))
 
 
 def _outage(trial: Trial) -> list[Finding]:

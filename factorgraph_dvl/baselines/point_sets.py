@@ -119,7 +119,7 @@ def residuals(points: Points, estimated: Estimated, lever_arm: Array) -> tuple[A
 def derivatives(points: Points, estimated: Estimated, lever_arm: Array) -> Array:
     """Return the derivatives of `residuals` by what was estimated, (M, 3, n).
 
-    Those by other parameters than these five, and by a time offset, are zero.
+    Those by a time offset, which changes the points themselves, are zero.
     """
     dRb = estimated.value("misalignment", np.eye(3))
     scale = 1.0 + estimated.value("scale_error", np.zeros(1))

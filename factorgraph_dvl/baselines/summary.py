@@ -32,22 +32,21 @@ from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 
-def treated_as_white(names: Sequence[str] = (), factors: Array | None = None) -> Finding:
+def treated_as_white(estimated: Estimated, factors: Array | None = None) -> Finding:
     """Say that errors of the motion count as white noise, and what that may do to deviations.
 
     Parameters
     ----------
-    names : sequence of str
-        Components (n,) of the calibration.
+    estimated : Estimated
+        The calibration, of n components.
     factors : ndarray, shape (n,), optional
         Factors by which their standard deviations may be too small.
     """
     if factors is None or factors.max(initial=1.0) <= TOO_LARGE:
         return Finding(Code.METHOD_LIMITS, message("method_limits.white_noise"))
     worst = int(np.argmax(factors))
-    text = message(
-        "method_limits.lasting_attitude", name=names[worst], factor=float(factors[worst])
-    )
+    name = [name for p in estimated.parameters for name in p.component_names][worst]
+    text = message("method_limits.lasting_attitude", name=name, factor=float(factors[worst]))
     return Finding(Code.METHOD_LIMITS, text, severity="warning")
 
 

@@ -276,7 +276,7 @@ class DvlBeams:
     def parameters(self) -> tuple[Parameter, ...]:
         """Return directions or misalignment, scale errors, lever arm, clock and window."""
         clock = self.clock.parameters(self.settings)
-        return (*self.mounting_parameters(), *clock, self.usual_parameter)
+        return (*self.mounting_parameters(), *clock, self.window_length)
 
     def mounting_parameters(self) -> tuple[Parameter, Parameter, Parameter]:
         """Return directions or misalignment, scale errors and lever arm."""
@@ -321,7 +321,7 @@ class DvlBeams:
         return _OWN_CLOCK if self.prefix else CLOCK
 
     @property
-    def usual_parameter(self) -> Parameter:
+    def window_length(self) -> Parameter:
         """Length of the window over which the instrument averages."""
         s = self.settings
         spec = _OWN_AVERAGING if self.prefix else AVERAGING_SPEC
@@ -351,7 +351,7 @@ class DvlBeams:
                 geometry,
                 lever_arm,
                 self.clock,
-                self.usual_parameter.name,
+                self.window_length.name,
             ),
         )
 

@@ -20,7 +20,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
 
-# Share of the sensors that neither average nor are late of which one is tried all the same.
+# Share of the sensors that neither average nor are late for which a time is tried all the same.
 # Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
 _BY_CHANCE = 0.05
 # Time between the slopes that show a curvature, s. Chosen: no window is shorter.
@@ -142,9 +142,8 @@ def _scores(
     )
     part.attach(evaluation.parameters)
     information = minimum.square_root or factorized(problem, evaluation)[0]
-    squares = {
-        name: by_square(problem, part, evaluation) for name in known if name == _length(bound)
-    }
+    length = _length(bound)
+    squares = {length: by_square(problem, part, evaluation)} if length in known else {}
     return record_scores(problem, part, evaluation, information, known, derivatives=squares)
 
 

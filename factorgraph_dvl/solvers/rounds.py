@@ -126,6 +126,10 @@ def settle(
         steps = [
             step for step in steps if isinstance(step, (MotionStrengths, States, GrossErrors))
         ]
+    elif constants_prior is not None:
+        # A joint prior knows what was estimated before, and of nothing else.
+        freeing = Averaging, KnownParameters, KnownParametersAgain
+        steps = [step for step in steps if not isinstance(step, freeing)]
     recorded, changed, going_on = at, "", True
     while going_on and len(record) < _MOST_STEPS:
         going_on = False

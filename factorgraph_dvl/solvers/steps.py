@@ -199,9 +199,6 @@ class Averaging:
         model = at.model
         if self._tested.before(model.parameters) or at.rough or at.problem.chain.interpolates:
             return
-        # A joint prior knows what was estimated before, and of nothing else.
-        if model.constants_prior is not None:
-            return
         self._tested.note(model.parameters)
         found = shown_windows(at.problem, at.minimum)
         if not found:
@@ -332,7 +329,7 @@ class KnownParameters:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the most probable of these, with noise as stated and as found."""
         asked = self.refined or self._tested.before(at.model.parameters)
-        if at.minimum.converged and not asked and at.model.constants_prior is None:
+        if at.minimum.converged and not asked:
             yield from self.tested(at)
 
     def tested(self, at: Estimated) -> Iterator[Proposal]:
@@ -392,7 +389,7 @@ class KnownParametersAgain:
             self._asked.note(model.parameters, model.processes)
             for cause in known.estimated_by(model):
                 yield Proposal(_with_others(at, cause.parameter), at.states, at.values)
-        if not known.refined and model.constants_prior is None:
+        if not known.refined:
             left, known.refined = known.left, True
             yield from known.tested(at)
             # None explains more.
