@@ -28,8 +28,9 @@ def robust_weights(
 ) -> tuple[dict[str, Array], Evaluation] | None:
     """Return weights 0 or 1 by label, and where the rest leads; None if there is no outlier.
 
-    A sensor's measurements are rejected only if that makes all of them more likely (`misfit`):
-    truncated squares alone may split honest noise into what is small and what is not.
+    A sensor's measurements are rejected only if that makes all of them more likely where the rest
+    leads (`misfit`): truncated squares alone may split honest noise into what is small and what is
+    not.
 
     Parameters
     ----------
@@ -73,12 +74,11 @@ def robust_weights(
         factor = problem.noise_factors.get(label)
         least = None if factor is None else LEAST_FACTOR / float(factor.min())
         of_noise = partial(misfit, sigma=sigma[i], unit=problem.observations[i].unit, least=least)
+        # Where all of them lead, the objective judges white noise; noise that persists is not yet
+        # in the model.
         honest = min(
-            min(
-                of_noise(each, rejected=np.zeros_like(out)),
-                persistent_misfit(each, sigma[i], least),
-            )
-            for each in (before[label], residuals[label])
+            of_noise(residuals[label], rejected=np.zeros_like(out)),
+            *(persistent_misfit(each[label], sigma[i], least) for each in (before, residuals)),
         )
         if out.any() and of_noise(residuals[label], rejected=out) < honest:
             found[label] = 1.0 - out.astype(float)

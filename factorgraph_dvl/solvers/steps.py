@@ -52,8 +52,6 @@ _MOST_SCATTER = 20.0
 # Fall of the objective from which on tests of what was stated as known are made again. Chosen: as
 # much as the most that chance makes of them.
 _KNOWN_BETTER = 30.0
-# Searches for gross errors. Chosen: the second finds those that the first could not see.
-_SEARCHES = 2
 
 
 @dataclass(frozen=True)
@@ -213,25 +211,23 @@ class GrossErrors:
     name = "gross errors"
 
     def __init__(self) -> None:
-        self._asked, self._searched = _Asked(), 0
+        self._asked = _Asked()
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the gross errors that are found where all measurements count."""
         model, problem = at.model, at.problem
-        own = model.parameters, model.prepared, _labels(model)
-        if not self._asked.before(*own):
-            self._asked.note(*own)
-            self._searched = 0
-        if self._searched >= _SEARCHES:
+        # Once some are left out, others show, and what was taken for some fits.
+        own = model.parameters, model.prepared, model.robust_weights, _labels(model)
+        if self._asked.before(*own):
             return
-        self._searched += 1
+        self._asked.note(*own)
         evaluation = at.minimum.evaluation
-        if model.robust_weights and self._searched == 1:
+        if model.robust_weights:
             problem.robust_weights = {}
             problem.weigh(evaluation)
         found = robust_weights(problem, evaluation)
         if found is None:
-            if model.robust_weights and self._searched == 1:
+            if model.robust_weights:
                 yield _from(at, robust_weights={})
             return
         weights, there = found

@@ -156,8 +156,12 @@ class SquareRootInformation:
             Keys to (size, sum n) matrices.
         """
         out: dict[int, Array] = {}
-        halfway = list(self._halfway(functionals))
-        for clique, z in zip(self._cliques, reversed(halfway), strict=True):
+        halfway = dict(self._halfway(functionals))
+        width = sum(next(iter(f.values())).shape[0] for f in functionals)
+        for index, clique in enumerate(self._cliques):
+            z = halfway.get(index)
+            if z is None:
+                z = np.zeros((clique.R.shape[0], width))
             if clique.separators:
                 z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
             x = _solve(clique.R, z, transposed=False)
@@ -202,11 +206,14 @@ class SquareRootInformation:
         ndarray, shape (sum n, sum n)
             Covariance.
         """
-        z = np.concatenate(list(self._halfway(functionals)))
+        z = np.concatenate([rows for _, rows in self._halfway(functionals)])
         return np.asarray(z.T @ z)
 
-    def _halfway(self, functionals: Sequence[Mapping[int, Array]]) -> Iterator[Array]:
-        """Yield the rows of z with Rᵀ z = Wᵀ, clique by clique from the leaves to the root."""
+    def _halfway(self, functionals: Sequence[Mapping[int, Array]]) -> Iterator[tuple[int, Array]]:
+        """Yield numbers of cliques, from the leaves to the root, and the rows of z with Rᵀ z = Wᵀ.
+
+        Cliques whose rows are zero are left out.
+        """
         widths = [next(iter(f.values())).shape[0] for f in functionals]
         edges = np.cumsum([0, *widths])
         total = int(edges[-1])
@@ -215,15 +222,15 @@ class SquareRootInformation:
             for key, matrix in functional.items():
                 block = pending.setdefault(key, np.zeros((self._sizes[key], total)))
                 block[:, first:last] += matrix.T
-        for clique in reversed(self._cliques):
+        for index in reversed(range(len(self._cliques))):
+            clique = self._cliques[index]
             if pending.keys().isdisjoint(clique.frontals):
-                yield np.zeros((clique.R.shape[0], total))
                 continue
             w = np.concatenate(
                 [pending.pop(key, np.zeros((self._sizes[key], total))) for key in clique.frontals]
             )
             z = _solve(clique.R, w, transposed=True)
-            yield z
+            yield index, z
             passed = -clique.T.T @ z
             row = 0
             for key in clique.separators:

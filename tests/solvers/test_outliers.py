@@ -102,6 +102,28 @@ def test_one_beam_is_left_out_alone():
     assert (~bad).sum() <= 5
 
 
+def test_one_wrong_ping_of_a_trial_without_imu_is_left_out():
+    lines = [
+        {"straight_s": 40},
+        {"turn_deg_s": 3, "duration_s": 40, "ramp_s": 5},
+        {"straight_s": 40},
+        {"turn_deg_s": -3, "duration_s": 40, "ramp_s": 5},
+    ]
+    trial = simulate(config("ship", manoeuvres=lines), 1)
+    velocity = trial.dvl.velocity.copy()
+    velocity[150] += 3.0
+    # The wrong ping can turn the mount as long as few others are left after it.
+    wrong = replace(trial, dvl=replace(trial.dvl, velocity=velocity)).until(160.0)
+    solution = solve(wrong, rate_hz=1.0)
+    (rejected,) = solution.rejected
+    # Chance may take one of the good ones for gross.
+    assert trial.dvl.time[150] in rejected.time and rejected.time.size <= 2
+    clean = solve(trial.until(160.0), rate_hz=1.0)
+    for name in ("misalignment_deg", "lever_arm_m"):
+        moved = solution.estimate(name).value - clean.estimate(name).value
+        assert np.all(np.abs(moved) < solution.estimate(name).std)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", list(CASES))
 def test_errors_are_those_of_clean_data(case):
