@@ -193,6 +193,10 @@ class Initializer:
         )
         return now >= self._solve_at or turned
 
+    def knew_less(self, now: float) -> bool:
+        """Whether the last batch solution was of less than the records up to now, s."""
+        return self._solved_at < now
+
     def solve(
         self, until: float, dt: float, since: float, navigator: AnyNavigator | None
     ) -> tuple[AnyStart | None, ClockJump | None]:

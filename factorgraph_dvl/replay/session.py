@@ -297,6 +297,9 @@ class Replay:
                 elif end and until >= self._arrived:
                     return
                 continue
+            if end and self._settings.imu is None and self._initializer.knew_less(self._reached):
+                # States are behind the records: they go on from the last solution to the end.
+                nav = self._solve_again(nav) or nav
             extended = self._extend(nav, end=end)
             if isinstance(extended, Gap):
                 self._restart(nav, extended)
