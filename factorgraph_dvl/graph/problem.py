@@ -100,6 +100,8 @@ class Problem:
         Fall of -2 log likelihood by that noise, against white noise.
     robust_weights : mapping of str to ndarray
         Weights of each label from 0 to 1 on the squares of residuals, (M, d) or (M, 1); likewise.
+    imu_errors : ImuErrors or None
+        Errors of the IMU that are estimated, None if there are none.
 
     Examples
     --------
@@ -159,9 +161,9 @@ class Problem:
             self._bound.append(bound)
             if not bound.usable.all():
                 self.uncovered[observation.label] = int((~bound.usable).sum())
-        self._imu_errors = chain.errors(self.parameters, self._key)
+        self.imu_errors: ImuErrors | None = chain.errors(self.parameters, self._key)
         for bound in self._bound:
-            bound.errors = self._imu_errors
+            bound.errors = self.imu_errors
         self._factors = MeasurementFactors.of(
             chain, self._bound, self.parameters, self._key, self.processes
         )
@@ -175,11 +177,6 @@ class Problem:
     def bound(self) -> tuple[BoundObservation, ...]:
         """The observations as they are tied to the chain."""
         return tuple(self._bound)
-
-    @property
-    def imu_errors(self) -> ImuErrors | None:
-        """Errors of the IMU that are estimated, None if there are none."""
-        return self._imu_errors
 
     @property
     def usable(self) -> dict[str, BoolArray]:
@@ -267,9 +264,9 @@ class Problem:
         if self.tilt is not None:
             own_cost += self.tilt.cost(self.parameters, parameters)
         imu = None
-        if self._imu_errors is not None:
-            errors = self._imu_errors.vector(parameters)
-            imu = self._imu_errors.linearized(self.graph.linearize(values), errors)
+        if self.imu_errors is not None:
+            errors = self.imu_errors.vector(parameters)
+            imu = self.imu_errors.linearized(self.graph.linearize(values), errors)
             own_cost += imu.more_cost
         for step in self.chain.steps(states):
             own_cost += 0.5 * float(np.vdot(step.residual, step.residual))
@@ -312,8 +309,8 @@ class Problem:
                 found[own] = bound.attached(parameters) if at is None else at
             out.append(found[own])
         self._attachments = found
-        if self._imu_errors is not None:
-            self._imu_errors.attach(out)
+        if self.imu_errors is not None:
+            self.imu_errors.attach(out)
         return out
 
     def without_tilt(self, evaluation: Evaluation) -> Evaluation:
@@ -489,8 +486,8 @@ class Problem:
         """Free the factors of measurements; the next linearisation makes others."""
         self._factors.release()
         self._steps = []
-        if self._imu_errors is not None:
-            self._imu_errors.release()
+        if self.imu_errors is not None:
+            self.imu_errors.release()
 
     def observation_rows(self, evaluation: Evaluation) -> Iterator[Rows]:
         """Yield the rows of each observation, some at a time.
@@ -543,10 +540,10 @@ class Problem:
 
     def native(self, evaluation: Evaluation) -> gtsam.GaussianFactorGraph:
         """Return the factors of priors, of processes and of GTSAM, linear at an evaluation."""
-        if self._imu_errors is None or evaluation.imu is None:
+        if self.imu_errors is None or evaluation.imu is None:
             out = self.graph.linearize(evaluation.values)
         else:
-            out = self._imu_errors.filled(evaluation.imu)
+            out = self.imu_errors.filled(evaluation.imu)
         for process in self.processes:
             process.add_prior(out, evaluation.parameters[process.name])
         return out
