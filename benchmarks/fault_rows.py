@@ -448,7 +448,7 @@ ROWS = (
         "m/s",
         (0.002, 0.01),
         lambda x: [g.truncated("dvl", x)],
-        (gross("DVL"),),
+        (gross("DVL"), r"dvl_truncation"),
     ),
     Row("DVL: averages", "s", (1.0, 3.0), lambda x: [g.dvl_averages(x)], (r"averaging",)),
     Row("IMU: gyros late", "s", (0.002, 0.01), lambda x: [g.gyros_late(x)], (r"gyro_delay",)),

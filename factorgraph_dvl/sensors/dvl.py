@@ -412,8 +412,11 @@ class DvlVelocity(ObservationByRows):
         scale, axes = values[SCALE_ERROR], values[MISALIGNMENT]
         if is_distorted(values):
             found = self._distortion(motion, values, dvl_b)
-            dvl_b, scale, axes = found.turned(), found.scale, found.axes @ axes
-        return (1.0 + scale) * (dvl_b @ axes.T) + values[BIAS] - self.measured_d
+            axes = found.axes @ axes
+            seen_d = found.truncated((1.0 + found.scale) * (found.turned() @ axes.T))
+        else:
+            seen_d = (1.0 + scale) * (dvl_b @ axes.T)
+        return seen_d + values[BIAS] - self.measured_d
 
     def _distortion(self, motion: Motion, values: Values, dvl_b: Array) -> Distortion:
         """Return what else becomes of velocities at the DVL, in body."""
@@ -429,13 +432,19 @@ class DvlVelocity(ObservationByRows):
             found = self._distortion(motion, values, dvl_b)
             scale, axes, flexed_b = 1.0 + found.scale, found.axes @ axes, found.turned()
         unscaled_d = flexed_b @ axes.T
+        seen_d, passed = scale * unscaled_d, np.ones_like(unscaled_d)
         dMb = by_velocity = scale[..., None] * axes
-        n_scale = values[SCALE_ERROR].size
-        d_scale = unscaled_d[:, :, None] if n_scale == 1 else unscaled_d[:, :, None] * np.eye(3)
+        if distorted:
+            passed = found.passed(seen_d)
+            seen_d = found.truncated(seen_d)
+            dMb = by_velocity = passed[:, :, None] * dMb
+        d_scale = (passed * unscaled_d)[:, :, None]
+        if values[SCALE_ERROR].size == 3:
+            d_scale = d_scale * np.eye(3)
         derivatives: dict[str, Callable[[], Array]] = {}
         more = None
         if distorted or not set(NAMES).isdisjoint(wanted):
-            more = self._distortion(motion, values, dvl_b).derivatives(unscaled_d, dMb)
+            more = self._distortion(motion, values, dvl_b).derivatives(unscaled_d, dMb, passed)
             derivatives |= more.parameters
             by_velocity = more.velocity
         d_v = by_velocity @ bRn
@@ -450,7 +459,7 @@ class DvlVelocity(ObservationByRows):
         if more is not None:
             d_theta, d_omega = d_theta + more.theta, d_omega + more.omega
         return Linearization(
-            residual=scale * unscaled_d + values[BIAS] - self.measured_d,
+            residual=seen_d + values[BIAS] - self.measured_d,
             d_theta=d_theta,
             d_p=None if more is None or not distorted else more.place,
             d_v=d_v,

@@ -7,6 +7,9 @@ scale, each axis of d reports
 
 where z are the x and y components of the vertical in body, the sines of its tilt, and omega those
 of the rate. k grows with speed, place and time. All of it is zero where a trial does not state it.
+
+What an axis reports, w, may then lose digits. Cut off towards zero, it is too small by half a
+digit c on average, or zero below that. A record has w - c w / sqrt(w^2 + c^2).
 """
 
 from __future__ import annotations
@@ -47,16 +50,19 @@ FLEX_BY_SPEED_SPEC = _spec("flex_by_speed", "deg_s_m", XYZ, 0.5, "b")
 SCALE_BY_SPEED_SPEC = _spec("scale_by_speed", "s_m", SCALAR, 0.01)
 SCALE_BY_PLACE_SPEC = _spec("scale_by_place", "1_km", ("e", "n", "u"), 0.1, "n")
 SCALE_BY_TIME_SPEC = _spec("scale_by_time", "1_h", SCALAR, 0.05)
+TRUNCATION_SPEC = _spec("truncation", "m_s", SCALAR, 0.01)
 
 SPECS = (
     *(AXES_SPEC, SCALE_DIFFERENCE_SPEC),
     *(FLEX_BY_TILT_SPEC, FLEX_BY_RATE_SPEC, FLEX_BY_SPEED_SPEC),
     *(SCALE_BY_SPEED_SPEC, SCALE_BY_PLACE_SPEC, SCALE_BY_TIME_SPEC),
+    TRUNCATION_SPEC,
 )
 NAMES = tuple(spec.name for spec in SPECS)
 AXES, SCALE_DIFFERENCE = NAMES[:2]
 FLEX_BY_TILT, FLEX_BY_RATE, FLEX_BY_SPEED = NAMES[2:5]
-SCALE_BY_SPEED, SCALE_BY_PLACE, SCALE_BY_TIME = NAMES[5:]
+SCALE_BY_SPEED, SCALE_BY_PLACE, SCALE_BY_TIME = NAMES[5:8]
+TRUNCATION = NAMES[8]
 # Pairs of axes by the labels of their angles.
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 # Least speed, m/s, that has a direction. Chosen: far below that of any ping.
@@ -140,30 +146,43 @@ class Distortion:
         """Return the velocity as the flexed mount turns it, E u, (M, 3), m/s."""
         return rotate(exp_so3(self.turn), self.velocity_b)
 
-    def derivatives(self, unscaled_d: Array, dMb: Array) -> DistortionDerivatives:
-        """Return the derivatives of (1 + k) A dRb E u.
+    def truncated(self, scaled_d: Array) -> Array:
+        """Return what the record has of velocities (1 + k) A dRb E u, (M, 3), m/s."""
+        cut = self._value(TRUNCATION_SPEC)
+        return scaled_d - cut * scaled_d / _length(scaled_d, cut)
+
+    def passed(self, scaled_d: Array) -> Array:
+        """Return the derivative of `truncated` by its argument, (M, 3)."""
+        cut = self._value(TRUNCATION_SPEC)
+        return 1.0 - (cut / _length(scaled_d, cut)) ** 3
+
+    def derivatives(self, unscaled_d: Array, dMb: Array, passed: Array) -> DistortionDerivatives:
+        """Return the derivatives of what the record has.
 
         Parameters
         ----------
         unscaled_d : ndarray, shape (M, 3), m/s
             A dRb E u.
         dMb : ndarray, shape (M, 3, 3)
-            (1 + k) A dRb.
+            (1 + k) A dRb, what passes of it.
+        passed : ndarray, shape (M, 3)
+            What passes.
         """
+        scaled_d = unscaled_d * (1.0 + self.scale)
         turn, speed, motion = self.turn, self._speed, self.motion
         flexed = dMb @ exp_so3(turn)
         by_turn = -flexed @ skew(self.velocity_b) @ _right_jacobians(turn)
         by_tilt, by_rate = self._matrices
         by_speed = by_turn @ self._value(FLEX_BY_SPEED_SPEC)
-        by_speed = by_speed + unscaled_d * self._value(SCALE_BY_SPEED_SPEC)
-        along = unscaled_d[:, :, None]
+        by_speed = by_speed + passed * unscaled_d * self._value(SCALE_BY_SPEED_SPEC)
+        along = (passed * unscaled_d)[:, :, None]
         return DistortionDerivatives(
             velocity=flexed + by_speed[:, :, None] * (self.velocity_b / speed)[:, None, :],
             theta=by_turn @ by_tilt @ skew(motion.nRb[:, 2])[:, :2],
             omega=np.pad(by_turn @ by_rate, ((0, 0), (0, 0), (0, 1))),
             place=along * self._value(SCALE_BY_PLACE_SPEC),
             parameters={
-                AXES: lambda: self._by_axes(unscaled_d),
+                AXES: lambda: passed[:, :, None] * self._by_axes(unscaled_d),
                 SCALE_DIFFERENCE: lambda: along * np.eye(3)[:, 1:],
                 FLEX_BY_TILT: lambda: _times(by_turn, self._tilt),
                 FLEX_BY_RATE: lambda: _times(by_turn, motion.omega_eb_b[:, :2]),
@@ -171,8 +190,12 @@ class Distortion:
                 SCALE_BY_SPEED: lambda: along * speed[:, :, None],
                 SCALE_BY_PLACE: lambda: along * motion.p_n[:, None, :],
                 SCALE_BY_TIME: lambda: along * self.since[:, None, None],
+                TRUNCATION: lambda: self._by_truncation(scaled_d)[:, :, None],
             },
         )
+
+    def _by_truncation(self, scaled_d: Array) -> Array:
+        return -((scaled_d / _length(scaled_d, self._value(TRUNCATION_SPEC))) ** 3)
 
     def _by_axes(self, unscaled_d: Array) -> Array:
         """Return the derivatives by the angles between axes, (M, 3, 3)."""
@@ -201,6 +224,11 @@ class DistortionDerivatives:
     omega: Array
     place: Array
     parameters: dict[str, Callable[[], Array]]
+
+
+def _length(velocity: Array, cut: Array) -> Array:
+    """Return the root of the sum of two squares, (M, 3), never zero."""
+    return np.maximum(np.hypot(velocity, cut), _AT_REST)
 
 
 def _times(by_turn: Array, signals: Array) -> Array:

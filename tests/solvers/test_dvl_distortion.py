@@ -36,12 +36,15 @@ FAULTS = {
     "dvl_flex_by_tilt": instrument_faults.dvl_flexes((0.0, 0.0, 0.1 / 3.0)),
     "dvl_scale_by_speed_s_m": instrument_faults.dvl_scale_by_speed(0.002),
     "dvl_scale_by_time_1_h": faults.dvl_scale_drift(0.002),
+    "dvl_truncation_m_s": instrument_faults.truncated("dvl", 0.01),
     "current_m_s": faults.dvl_water_track((0.1, 0.0, 0.0), np.inf),
     "gyro_delay_s": instrument_faults.gyros_late(0.01),
 }
 EXPECTED = {
     "dvl_scale_by_speed_s_m": 0.002,
     "dvl_scale_by_time_1_h": 0.002 * 3600.0 / 450.0,
+    # Half a digit.
+    "dvl_truncation_m_s": 0.005,
     "current_m_s": (0.1, 0.0),
     "gyro_delay_s": 0.01,
 }
