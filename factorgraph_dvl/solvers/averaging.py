@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,8 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
-from factorgraph_dvl.solvers.record_scores import RecordScores, record_scores
+from factorgraph_dvl.solvers.record_scores import record_scores
+from factorgraph_dvl.statistics.scores import Scores
 
 # Share of the sensors that neither average nor are late for which a time is tried all the same.
 # Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
@@ -53,12 +54,14 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
     out: dict[str, Parameter] = {}
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         observation = bound.observation
-        own = [name for name in parameters_of(observation) if name in known]
-        usual = sum(known[name].spec.usual for name in own)
+        own = {name: known[name] for name in parameters_of(observation) if name in known}
+        usual = sum(p.spec.usual for p in own.values())
         if observation.clock is None or not usual or not bound.weight.any():
             continue
-        tests = _scores(problem, bound, minimum, own)
-        found = {name: tests.test(name).chi2 for name in own}
+        # Nothing is known of them, whatever they are stated to be.
+        unknown = {name: np.full(p.mean.size, np.inf) for name, p in own.items()}
+        tests = _scores(problem, bound, minimum, unknown)
+        found = {name: tests.test([name]).chi2 for name in own}
         # A clock and a delay beside it do the same to a record: the clock is what is stated.
         cause = max(own, key=lambda name: (found[name], known[name].spec.usual))
         if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
@@ -125,8 +128,8 @@ def _length(bound: BoundObservation) -> str:
 
 
 def _scores(
-    problem: Problem, bound: BoundObservation, minimum: Minimum, known: Sequence[str]
-) -> RecordScores:
+    problem: Problem, bound: BoundObservation, minimum: Minimum, known: Mapping[str, Array]
+) -> Scores:
     """Return the scores of known parameters, the length of the window among them, of a record.
 
     Of many measurements, some. The square of the length stands in its place: it has a slope at 0.

@@ -219,15 +219,16 @@ def _shown_by_records(
         problem.bound, evaluation.attached, evaluation.motions, strict=True
     ):
         label = bound.observation.label
-        own = [name for name in parameters_of(bound.observation) if name in known]
+        own = [known[name] for name in parameters_of(bound.observation) if name in known]
         if not (own and bound.weight.any()):
             continue
         here = replace(bound, attachment=at)
-        found = record_scores(problem, here, evaluation, information, own, motion)
+        priors = {p.name: wide(p, p.mean).sigma for p in own}
+        found = record_scores(problem, here, evaluation, information, priors, motion)
         ratio = scattered[label] / problem.noise_factors[label] if label in scattered else 1.0
         variance = float(np.mean(np.square(ratio)))
-        for p in (known[name] for name in own):
-            test = found.test(p.name, wide(p, p.mean).sigma).divided(variance)
+        for p in own:
+            test = found.test([p.name]).divided(variance)
             if test.log10_p < _limit(p):
                 out.append(p)
     return out

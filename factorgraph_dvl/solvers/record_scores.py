@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -14,56 +13,11 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.statistics.rows import add_transposed_product
-from factorgraph_dvl.statistics.scores import Score
+from factorgraph_dvl.statistics.scores import Scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
-# Relative size of an eigenvalue of information that is none.
-_ROUNDING = 1e-9
 # Measurements whose derivatives are there at once. Chosen: some ten megabytes.
 _CHUNK = 4096
-
-
-@dataclass(frozen=True)
-class RecordScores:
-    """Scores S and information I of parameters of one record, all else following.
-
-    Parameters
-    ----------
-    places : dict of str to slice
-        Components of each parameter among all.
-    score : ndarray, shape (C,)
-        Downward gradient of the cost, 1/SI.
-    information : ndarray, shape (C, C)
-        Information of the data, 1/SI², which may be singular.
-    """
-
-    places: dict[str, slice]
-    score: Array
-    information: Array
-
-    def test(self, name: str, wide: Array | float = np.inf) -> Score:
-        """Return the test of a parameter; the step is zero along what nothing is known of.
-
-        Parameters
-        ----------
-        name : str
-            Name of the parameter.
-        wide : ndarray or float, SI
-            Standard deviations of its prior; by default it has none.
-        """
-        own = self.places[name]
-        score = self.score[own]
-        prior = np.broadcast_to(np.asarray(wide, float) ** -2.0, score.size)
-        information = self.information[own, own] + np.diag(prior)
-        size = np.sqrt(np.maximum(np.diag(information), 0.0))
-        known = size > _ROUNDING * np.max(size, initial=0.0)
-        # In units in which each component has an information of one.
-        gain = np.divide(1.0, size, out=np.zeros_like(size), where=known)
-        inverse = np.linalg.pinv(np.outer(gain, gain) * information, _ROUNDING, hermitian=True)
-        inverse *= np.outer(gain, gain)
-        step = inverse @ score
-        std = np.where(known, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.inf)
-        return Score(float(score @ step), step.size, step, std)
 
 
 def record_scores(
@@ -71,10 +25,10 @@ def record_scores(
     bound: BoundObservation,
     evaluation: Evaluation,
     information: SquareRootInformation,
-    names: Sequence[str],
+    candidates: Mapping[str, Array],
     motion: Motion | None = None,
     derivatives: Mapping[str, Array] = MappingProxyType({}),
-) -> RecordScores:
+) -> Scores:
     """Return scores and information of parameters that change one record only.
 
     With J the whitened derivatives by them, A those by all variables, P the covariance of these
@@ -94,8 +48,8 @@ def record_scores(
         The minimum.
     information : SquareRootInformation
         Information on all variables there.
-    names : sequence of str
-        The parameters.
+    candidates : mapping of str to ndarray
+        Standard deviations (n,) of the wide prior of each, SI; they may be infinite.
     motion : Motion, optional
         Motion where the observation is attached, if it is known.
     derivatives : mapping of str to ndarray, optional
@@ -106,9 +60,9 @@ def record_scores(
         motion = bound.motion(bound.attachment, evaluation.states, values)
     own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
     wanted = [p.name for p in own]
-    lin = bound.linearized(motion, values, [*wanted, *names], processes)
+    lin = bound.linearized(motion, values, [*wanted, *candidates], processes)
     lin.d_parameters.update(derivatives)
-    edges = np.cumsum([0, *(lin.d_parameters[name].shape[2] for name in names)]).tolist()
+    edges = np.cumsum([0, *(sigma.size for sigma in candidates.values())]).tolist()
     keys = bound.keys_at(bound.nodes(processes), processes, [problem.key(n) for n in wanted])
     sizes = tuple(bound.sizes(processes, own))
     o = bound.observation
@@ -119,7 +73,7 @@ def record_scores(
         rows, residual = bound.jacobian(
             lin, some, motion, evaluation.states, values, wanted, processes, {}
         )
-        by_names = np.concatenate([lin.d_parameters[name][some] for name in names], axis=2)
+        by_names = np.concatenate([lin.d_parameters[name][some] for name in candidates], axis=2)
         by_names = bound.weight[some][:, :, None] * by_names
         part = Rows(o.label, o.components, keys[some], sizes, rows, residual, begin)
         add_transposed_product(part, by_names, taken_up)
@@ -127,5 +81,5 @@ def record_scores(
         score -= flat.T @ residual.ravel()
         square += flat.T @ flat
     square -= information.covariance_of([taken_up])
-    places = {name: slice(*ends) for name, ends in zip(names, pairwise(edges), strict=True)}
-    return RecordScores(places, score, square)
+    places = {name: slice(*ends) for name, ends in zip(candidates, pairwise(edges), strict=True)}
+    return Scores(places, score, square, np.concatenate(list(candidates.values())))

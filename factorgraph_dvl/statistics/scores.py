@@ -12,6 +12,9 @@ from scipy.special import chdtrc
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
+# Relative size of an eigenvalue of information that is none.
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True)
 class Score:
@@ -73,9 +76,10 @@ class Scores:
     score : ndarray, shape (C,)
         Downward gradient of the cost, 1/SI.
     information : ndarray, shape (C, C)
-        Information of the data, 1/SI².
+        Information of the data, 1/SI², which may be singular.
     wide : ndarray, shape (C,)
-        Standard deviations of the wide priors, SI: what the data do not inform on stays there.
+        Standard deviations of the wide priors, SI, also infinite: what the data do not inform on
+        stays there.
     """
 
     places: Mapping[str, slice]
@@ -84,13 +88,21 @@ class Scores:
     wide: Array
 
     def test(self, names: Sequence[str]) -> Score:
-        """Return the test of some candidates together, all others being right."""
+        """Return the test of some candidates together, all others being right.
+
+        The step is zero along what nothing is known of.
+        """
         rows = np.concatenate([np.arange(self.score.size)[self.places[name]] for name in names])
-        own, score = self.information[np.ix_(rows, rows)], self.score[rows]
-        own = own + np.diag(self.wide[rows] ** -2)
-        inverse = np.linalg.inv(own)
-        step = inverse @ score
-        return Score(float(score @ step), rows.size, step, np.sqrt(np.diag(inverse)))
+        information = self.information[np.ix_(rows, rows)] + np.diag(self.wide[rows] ** -2.0)
+        size = np.sqrt(np.maximum(np.diag(information), 0.0))
+        known = size > _ROUNDING * np.max(size, initial=0.0)
+        # In units in which each component has an information of one.
+        gain = np.divide(1.0, size, out=np.zeros_like(size), where=known)
+        units = np.outer(gain, gain)
+        inverse = units * np.linalg.pinv(units * information, _ROUNDING, hermitian=True)
+        step = inverse @ self.score[rows]
+        std = np.where(known, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.inf)
+        return Score(float(self.score[rows] @ step), rows.size, step, std)
 
 
 def scores(
