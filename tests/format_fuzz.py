@@ -1,8 +1,9 @@
-"""Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
+"""Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]] [--import]`.
 
 COUNT inputs of at most 64 kB for each reader of this package, or for those named (with commas
 between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `tlog` and
-`nucleus`; their process has limits of time and memory.
+`nucleus`; their process has limits of time and memory. With `--import`, all of `import` reads
+each input, from recognising it to writing the trial.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ import format_samples as samples
 import format_writers as writers
 import numpy as np
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import FactorgraphDvlError
 from factorgraph_dvl.files.formats.catalogue import FORMATS
+from factorgraph_dvl.files.importing.raw_files import import_files
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LIMIT = 1 << 16
@@ -220,12 +222,15 @@ def limit(count):
 
 
 def damage(data, rng):
+    """Return a part of the data with one to three faults; one in twenty is no such file at all."""
+    if rng.random() < 0.05:
+        return garbage(rng)
     data = bytearray(data)
     if rng.random() < 0.5 and len(data) > 2000:
         at = int(rng.integers(0, len(data) - 1000))
         data = data[at : at + int(rng.integers(500, len(data) - at))]
     for _ in range(int(rng.integers(1, 4))):
-        kind = int(rng.integers(0, 7))
+        kind = int(rng.integers(0, 8))
         size = max(len(data), 1)
         at = int(rng.integers(0, size))
         if kind == 0:
@@ -244,6 +249,12 @@ def damage(data, rng):
             data[at : at + 300] = bytes(
                 [int(rng.choice([0, 0x7F, 0xA5, 0x80, 0xFF, 0x24, 0x7B, 0x0A]))]
             ) * int(rng.integers(1, 3000))
+        elif kind == 6:
+            long = int(rng.integers(1, 1 + size // 2))
+            first, second = sorted(rng.integers(0, size, 2))
+            second = max(second, first + long)
+            parts = data[first : first + long], data[second : second + long]
+            data[second : second + long], data[first : first + long] = parts
         else:
             for i in rng.integers(0, size, 20):
                 if i < len(data):
@@ -251,8 +262,22 @@ def damage(data, rng):
     return bytes(data[:LIMIT])
 
 
-def run(name, count, seed):
-    """Feed the reader of a format `count` inputs, the whole files first.
+def garbage(rng):
+    """Return nothing, bytes, or words and numbers as text."""
+    kind = int(rng.integers(0, 4))
+    if kind == 0:
+        return b""
+    if kind == 1:
+        return rng.bytes(int(rng.integers(1, 5000)))
+    words = ["time", "vx", "nan", "-1e999", "1", "2.5", "$GPGGA", *'{}[]":\0\n']
+    between = [" ", ",", ";", "\t", "\n", "*"][int(rng.integers(0, 6))]
+    text = between.join(rng.choice(words, int(rng.integers(1, 2000))))
+    # As an editor on Windows saves it.
+    return text.encode("utf-16" if kind == 3 else "utf-8")
+
+
+def run(name, count, seed, *, whole=False):
+    """Feed the reader of a format `count` inputs, the whole files first; or, `whole`, `import`.
 
     Returns
     -------
@@ -278,9 +303,14 @@ def run(name, count, seed):
             if is_measured:
                 tracemalloc.start()
             try:
-                form.share(path, data)
-                out["useful"] += any([len(batch.records) > 0 for batch in form.read(path, None)])
-            except DataError:
+                if whole:
+                    import_files([path], Path(folder) / "trial", force=True)
+                    out["useful"] += 1
+                else:
+                    form.share(path, data)
+                    batches = [len(batch.records) > 0 for batch in form.read(path, None)]
+                    out["useful"] += any(batches)
+            except FactorgraphDvlError:
                 out["refused"] += 1
             if is_measured:
                 out["most"] = max(out["most"], tracemalloc.get_traced_memory()[1])
@@ -292,12 +322,13 @@ def run(name, count, seed):
 
 
 def main():
-    count, seed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    args = [arg for arg in sys.argv[1:] if arg != "--import"]
+    count, seed = int(args[0]), int(args[1]) if len(args) > 1 else 0
     warnings.simplefilter("error")
-    for name in sys.argv[3].split(",") if len(sys.argv) > 3 else OWN:
+    for name in args[2].split(",") if len(args) > 2 else OWN:
         if name in LIBRARIES:
             limit(count)
-        found = run(name, count, seed)
+        found = run(name, count, seed, whole="--import" in sys.argv)
         print(
             f"{name:13} {count} inputs, {found['refused']} refused, {found['useful']} with "
             f"records, slowest {found['slowest'] * 1e3:.0f} ms, at most {found['most'] >> 10} kB",

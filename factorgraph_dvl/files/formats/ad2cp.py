@@ -145,6 +145,7 @@ def read_ad2cp(
         elif kind != TEXT:
             losses.skip(f"record 0x{kind:02X}", UNKNOWN_TYPE)
         else:
+            losses.use("text")
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
         if len(pings) + len(dvl) + len(text) >= block:
             yield Ad2cp(_bottom_track(pings, losses), tracks(dvl), tuple(text))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from factorgraph_dvl.files.formats.format import Clock, HeadingReference, Kind
 from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
@@ -237,3 +238,16 @@ class MappingSettings(Section, frozen=True, kw_only=True):
         """Return the tables that a file contains, or the topics that a bag does."""
         fits = (table for table in self.tables if fnmatchcase(path.name, table.file))
         return tuple(table for table in fits if bool(table.topic) == topics)
+
+    def source_of(self, table: TableMapping) -> str:
+        """Return the name of the source of a table: its kind, and its file beside other sources.
+
+        Tables that differ only in their files, as parts of one record do, are of one source.
+        """
+        alike = [
+            other
+            for other in self.tables
+            if other.kind == table.kind and replace(other, file="") == replace(table, file="")
+        ]
+        first = next(other for other in self.tables if other.kind == table.kind)
+        return table.kind if first in alike else f"{table.kind} {alike[0].file}"
