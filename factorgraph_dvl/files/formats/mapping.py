@@ -240,14 +240,14 @@ class MappingSettings(Section, frozen=True, kw_only=True):
         return tuple(table for table in fits if bool(table.topic) == topics)
 
     def source_of(self, table: TableMapping) -> str:
-        """Return the name of the source of a table: its kind, and its file beside other sources.
+        """Return the name of the source of a table: its kind, with a number from the second on.
 
         Tables that differ only in their files, as parts of one record do, are of one source.
         """
-        alike = [
-            other
-            for other in self.tables
-            if other.kind == table.kind and replace(other, file="") == replace(table, file="")
-        ]
-        first = next(other for other in self.tables if other.kind == table.kind)
-        return table.kind if first in alike else f"{table.kind} {alike[0].file}"
+        sources: list[TableMapping] = []
+        for other in self.tables:
+            source = replace(other, file="")
+            if other.kind == table.kind and source not in sources:
+                sources.append(source)
+        number = sources.index(replace(table, file="")) + 1
+        return table.kind if number == 1 else f"{table.kind} {number}"

@@ -235,16 +235,18 @@ def _parse(block: bytes, separator: bytes, count: int) -> tuple[pa.Table, list[b
     """Return the rows of a block as text, and those that have another number of cells."""
     if separator == b" ":
         block = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)", b"", block))
+    # The library takes UTF-8 only; what is no number need not be readable.
+    text = block if block.isascii() else block.decode("latin-1").encode()
     dropped: list[bytes] = []
 
     def skip(row: Any) -> str:
-        dropped.append(row.text.encode())
+        dropped.append(row.text.encode("latin-1"))
         return "skip"
 
     names = [str(i) for i in range(count)]
     try:
         table = pyarrow.csv.read_csv(
-            io.BytesIO(block),
+            io.BytesIO(text),
             read_options=pyarrow.csv.ReadOptions(
                 column_names=names, block_size=_BLOCK + _LONGEST_LINE
             ),
