@@ -67,8 +67,8 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
             decisions.add(timed.stream.label, "of the vessel, not used: another one has more")
     if position is None or heading is None:
         lack = "position" if position is None else "heading"
-        decisions.add(
-            places.label, f"no file has the {lack} of the vessel → relative places are not used"
+        decisions.warn(
+            f"{places.label}: no file has the {lack} of the vessel → relative places are not used"
         )
         return others
     decisions.add(

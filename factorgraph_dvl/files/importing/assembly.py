@@ -135,11 +135,12 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     depth = motion.choose(streams, "depth", decisions)
     if depth is not None:
         out.add("depth", lambda zero: motion.depth_tables(depth, zero), std_m=0.1)
-    chosen = [imu, ins, deviations, depth]
+    chosen = [imu, ins] if attitude is None else [attitude.attitude]
     chosen += [] if gnss is None else [gnss.fixes, gnss.courses]
-    chosen += [] if attitude is None else [attitude.attitude]
-    chosen += [] if log is None else [log.pings]
-    _say_unused(streams, chosen, decisions)
+    chosen += [deviations, depth] if log is None else [deviations, depth, log.pings]
+    used = [part for part in chosen if part is not None]
+    _say_unused(streams, used, decisions)
+    _say_apart(used, decisions)
     if gnss is None and ins is None:
         decisions.lack(NO_POSITION)
     if log is None:
@@ -190,12 +191,18 @@ def _place(
     return None
 
 
-def _say_unused(
-    streams: Sequence[Timed], used: Sequence[Merged | None], decisions: Decisions
-) -> None:
+def _say_apart(used: Sequence[Merged], decisions: Decisions) -> None:
+    """Warn of records that have no time in common with the first ones, of the motion."""
+    for other in used[1:]:
+        (begin, end), (start, stop) = (part.sample_time[[0, -1]] for part in (used[0], other))
+        if start > end or stop < begin:
+            decisions.warn(f"{other.label}: no time in common with {used[0].label}")
+
+
+def _say_unused(streams: Sequence[Timed], used: Sequence[Merged], decisions: Decisions) -> None:
     """Say of the kinds of which nothing is used why; of others `best_source` says it."""
-    kinds = {timed.stream.kind for part in used if part is not None for timed in part.streams}
-    labels = {timed.stream.label for part in used if part is not None for timed in part.streams}
+    kinds = {timed.stream.kind for part in used for timed in part.streams}
+    labels = {timed.stream.label for part in used for timed in part.streams}
     for timed in streams:
         kind, label = timed.stream.kind, timed.stream.label
         # A navigation solution beside an IMU may be used as fixes.
