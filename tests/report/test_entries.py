@@ -201,7 +201,8 @@ def test_a_result_without_a_dvl_has_nothing_to_enter() -> None:
 
 def test_the_sum_of_mount_and_compass_comes_first() -> None:
     text = message(
-        "heading_error.about_the_vertical",
+        "heading_error.bearing",
+        axis="y",
         angle=-1.5,
         std=0.3,
         relative=-1.4,
@@ -213,6 +214,6 @@ def test_the_sum_of_mount_and_compass_comes_first() -> None:
         own, findings=(Finding(Code.HEADING_ERROR, text, parameter="misalignment_deg"),)
     )
     shown = instrument_text(found)
-    assert "# Mount and compass: about the vertical -1.5" in shown
+    assert "# Mount and compass: the y axis of the DVL points -1.5" in shown
     assert shown.index("Mount and compass") < shown.index("enter_in_dvl")
     assert "Mount and compass" not in instrument_text(own)
