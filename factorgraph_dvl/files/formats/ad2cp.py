@@ -505,7 +505,8 @@ FORMATS = (
         "Nortek AD2CP: bottom track (0x17), tracks of DVLs (0x1B, 0x1D), text",
         share,
         read,
-        "one recording (VelEchoBT01), by mhkit; 0x1B and 0x1D by public readers that agree only",
+        "one recording (VelEchoBT01), by mhkit, counts by type by a script; 0x1B and 0x1D by "
+        "public readers that agree only",
         (".ad2cp",),
     ),
 )
