@@ -26,7 +26,7 @@ import format_writers as writers
 import msgspec
 import numpy as np
 
-from factorgraph_dvl.errors import FactorgraphDvlError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.formats.catalogue import FORMATS
 from factorgraph_dvl.files.formats.mapping import MappingSettings
 from factorgraph_dvl.files.importing.guess import guess_all
@@ -327,7 +327,8 @@ def run(name, count, seed, *, whole=False):
                     plain = None if mapping is None else msgspec.to_builtins(mapping)
                     batches = [len(batch.records) > 0 for batch in form.read(path, plain)]
                     out["useful"] += any(batches)
-            except FactorgraphDvlError:
+            except (ConfigError, DataError):
+                # With which a command ends with exit code 2.
                 out["refused"] += 1
             if is_measured:
                 out["most"] = max(out["most"], tracemalloc.get_traced_memory()[1])
