@@ -111,6 +111,32 @@ def test_a_log_without_a_date_is_related_by_how_the_vehicle_turns(tmp_path, orde
     assert first == pytest.approx(20.0 + shift, abs=0.2)
 
 
+def test_speeds_are_compared_with_positions_that_have_no_utc(tmp_path):
+    """The DVL counts from its start; GPS_INPUT states no GPS time: it has that of a computer."""
+    pytest.importorskip("pymavlink")
+    speed = np.abs(np.cumsum(np.random.default_rng(4).normal(0.0, 0.3, 600)))
+    metres = np.concatenate([[0.0], np.cumsum(speed)])
+    data = b""
+    for t in range(500):
+        place = (540000000 + round(metres[t] / 6.371e6 / DEG * 1e7), -30000002)
+        given = (0, 0, *place, -4.5, 1.0, 1.0, 0.0, 0.0, 0.0, 0.4, 0.5, 0.5)
+        at = START + t
+        data += logs.telemetry("GPS_INPUT", at, *given, 16, 0, 0, 3, 10, sender=(1, 220))
+        data += logs.telemetry("ATTITUDE", at, 1000 * t, 0.0, 0.0, 0.0, 0, 0, 0)
+    (tmp_path / "a.tlog").write_bytes(data)
+    # Half a second after each fix, the DVL has the mean speed until the next one.
+    rows = (f"{t + 0.5 - 80.0},{speed[t]:.4f},0.0,0.0,0.01,1" for t in range(100, 400))
+    table = "\n".join(["timestamp,vx,vy,vz,fom,velocity_valid", *rows])
+    (tmp_path / "dvl.csv").write_text(table)
+    decisions = import_files([tmp_path / "dvl.csv", tmp_path / "a.tlog"], tmp_path / "trial")
+    assert "dvl.csv: its clock starts at" in decisions.text("")
+    assert "where its speeds agree with those of other files" in decisions.text("")
+    time = read_table(tmp_path / "trial" / "dvl.parquet", ("time_s",))["time_s"]
+    epoch = read_yaml(tmp_path / "trial" / "trial.yaml", dict)["epoch"]
+    first = np.datetime64(epoch.removesuffix("Z"), "s").astype(float) + time[0]
+    assert first == pytest.approx(START + 100.5, abs=0.3)
+
+
 def test_a_log_of_another_dive_is_refused(tmp_path):
     """Its stamps are no dates: taken as UTC, they would be in 1970."""
     pytest.importorskip("pymavlink")
