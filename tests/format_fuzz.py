@@ -1,8 +1,9 @@
-"""Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]]`.
+"""Feed readers damaged input: `python tests/format_fuzz.py COUNT [SEED [READERS]] [--import]`.
 
 COUNT inputs of at most 64 kB for each reader of this package, or for those named (with commas
 between). Readers of third-party libraries are named: `bag`, `ardupilot`, `ulog`, `tlog` and
-`nucleus`; their process has limits of time and memory.
+`nucleus`; their process has limits of time and memory. With `--import`, all of `import` reads
+each input, from recognising it to writing the trial.
 """
 
 from __future__ import annotations
@@ -22,10 +23,15 @@ from pathlib import Path
 import format_logs as logs
 import format_samples as samples
 import format_writers as writers
+import msgspec
 import numpy as np
 
-from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.files.formats.catalogue import FORMATS
+from factorgraph_dvl.files.formats.mapping import MappingSettings
+from factorgraph_dvl.files.importing.guess import guess_all
+from factorgraph_dvl.files.importing.raw_files import import_files
+from factorgraph_dvl.settings.yaml_file import parse_yaml
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 LIMIT = 1 << 16
@@ -34,6 +40,11 @@ WHEN = datetime(2021, 3, 4, 5, 6, 7, 120000, UTC)
 # each input besides that for starting.
 MOST_MEMORY = 4 << 30
 SLOWEST, STARTING = 2.0, 60.0
+# Tables of a velocity log with a compass of its own.
+LOG = "time_s,vel_x_m_s,vel_y_m_s,vel_z_m_s,roll_deg,pitch_deg,heading_deg\n" + "".join(
+    f"{1e9 + i},1.5,{0.01 * i:.2f},-0.1,1.0,2.0,{30 + i % 7}\n" for i in range(200)
+)
+TABLES = [("", LOG.encode()), ("", LOG.replace(",", ";").replace("m_s", "mm_s").encode())]
 
 
 def head(path, count=LIMIT):
@@ -158,6 +169,11 @@ def own_files():
     }
 
 
+def guessed(path):
+    """Return the mapping that is proposed for a table."""
+    return parse_yaml(guess_all([path]), MappingSettings, source="guess")
+
+
 def database():
     """Return a ROS 2 bag in SQLite, as recorders before definitions were stored wrote it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -202,7 +218,7 @@ def of_libraries():
     }
 
 
-OWN = [form.name for form in FORMATS if not form.module and form.family != "table"]
+OWN = [form.name for form in FORMATS if not form.module]
 LIBRARIES = [form.name for form in FORMATS if form.module]
 
 
@@ -220,12 +236,15 @@ def limit(count):
 
 
 def damage(data, rng):
+    """Return a part of the data with one to three faults; one in twenty is no such file at all."""
+    if rng.random() < 0.05:
+        return garbage(rng)
     data = bytearray(data)
     if rng.random() < 0.5 and len(data) > 2000:
         at = int(rng.integers(0, len(data) - 1000))
         data = data[at : at + int(rng.integers(500, len(data) - at))]
     for _ in range(int(rng.integers(1, 4))):
-        kind = int(rng.integers(0, 7))
+        kind = int(rng.integers(0, 8))
         size = max(len(data), 1)
         at = int(rng.integers(0, size))
         if kind == 0:
@@ -244,6 +263,12 @@ def damage(data, rng):
             data[at : at + 300] = bytes(
                 [int(rng.choice([0, 0x7F, 0xA5, 0x80, 0xFF, 0x24, 0x7B, 0x0A]))]
             ) * int(rng.integers(1, 3000))
+        elif kind == 6:
+            long = int(rng.integers(1, 1 + size // 2))
+            first, second = sorted(rng.integers(0, size, 2))
+            second = max(second, first + long)
+            parts = data[first : first + long], data[second : second + long]
+            data[second : second + long], data[first : first + long] = parts
         else:
             for i in rng.integers(0, size, 20):
                 if i < len(data):
@@ -251,8 +276,22 @@ def damage(data, rng):
     return bytes(data[:LIMIT])
 
 
-def run(name, count, seed):
-    """Feed the reader of a format `count` inputs, the whole files first.
+def garbage(rng):
+    """Return nothing, bytes, or words and numbers as text."""
+    kind = int(rng.integers(0, 4))
+    if kind == 0:
+        return b""
+    if kind == 1:
+        return rng.bytes(int(rng.integers(1, 5000)))
+    words = ["time", "vx", "nan", "-1e999", "1", "2.5", "$GPGGA", *'{}[]":\0\n']
+    between = [" ", ",", ";", "\t", "\n", "*"][int(rng.integers(0, 6))]
+    text = between.join(rng.choice(words, int(rng.integers(1, 2000))))
+    # As an editor on Windows saves it.
+    return text.encode("utf-16" if kind == 3 else "utf-8")
+
+
+def run(name, count, seed, *, whole=False):
+    """Feed the reader of a format `count` inputs, the whole files first; or, `whole`, `import`.
 
     Returns
     -------
@@ -264,7 +303,7 @@ def run(name, count, seed):
     if form.module:
         bases = [(ending, make()) for ending, make in of_libraries()[name]]
     else:
-        bases = files()[name]
+        bases = TABLES if name == "table" else files()[name]
     rng = np.random.default_rng([seed, *name.encode()])
     out = {"refused": 0, "useful": 0, "slowest": 0.0, "most": 0}
     with tempfile.TemporaryDirectory() as folder:
@@ -273,14 +312,23 @@ def run(name, count, seed):
             data = damage(base, rng) if index >= len(bases) else base
             path = Path(folder) / f"log{ending}"
             path.write_bytes(data)
-            is_measured = not form.module and index % 20 == 0
+            # Not the first one, for which modules are loaded.
+            is_measured = not form.module and index % 20 == 19
             start = time.process_time()
             if is_measured:
                 tracemalloc.start()
             try:
-                form.share(path, data)
-                out["useful"] += any([len(batch.records) > 0 for batch in form.read(path, None)])
-            except DataError:
+                mapping = guessed(path) if name == "table" else None
+                if whole:
+                    import_files([path], Path(folder) / "trial", mapping=mapping, force=True)
+                    out["useful"] += 1
+                else:
+                    form.share(path, data)
+                    plain = None if mapping is None else msgspec.to_builtins(mapping)
+                    batches = [len(batch.records) > 0 for batch in form.read(path, plain)]
+                    out["useful"] += any(batches)
+            except (ConfigError, DataError):
+                # With which a command ends with exit code 2.
                 out["refused"] += 1
             if is_measured:
                 out["most"] = max(out["most"], tracemalloc.get_traced_memory()[1])
@@ -292,12 +340,13 @@ def run(name, count, seed):
 
 
 def main():
-    count, seed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
+    args = [arg for arg in sys.argv[1:] if arg != "--import"]
+    count, seed = int(args[0]), int(args[1]) if len(args) > 1 else 0
     warnings.simplefilter("error")
-    for name in sys.argv[3].split(",") if len(sys.argv) > 3 else OWN:
+    for name in args[2].split(",") if len(args) > 2 else OWN:
         if name in LIBRARIES:
             limit(count)
-        found = run(name, count, seed)
+        found = run(name, count, seed, whole="--import" in sys.argv)
         print(
             f"{name:13} {count} inputs, {found['refused']} refused, {found['useful']} with "
             f"records, slowest {found['slowest'] * 1e3:.0f} ms, at most {found['most'] >> 10} kB",

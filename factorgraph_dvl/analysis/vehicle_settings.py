@@ -23,6 +23,7 @@ from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.notation import fixed
+from factorgraph_dvl.quality.texts import text_of
 from factorgraph_dvl.quality.verdict import Grade
 from factorgraph_dvl.sensors.dvl import TIME_OFFSET
 from factorgraph_dvl.solution import Calibration, Solution
@@ -249,7 +250,7 @@ def _nucleus(i: InstrumentTerms, delay: tuple[float, Grade] | None) -> Lines:
 
 
 def _not_set(maker: str, i: InstrumentTerms, angles: str) -> Lines:
-    yield from mount_in_words(i.axes)
+    yield from map(text_of, mount_in_words(i.axes))
     arm = ", ".join(fixed(float(x), 3) for x in i.lever_arm)
     yield f"{maker} has no setting for what follows: {_ELSEWHERE}."
     yield f"- mounting angles: {angles} (starboard down, bow up, clockwise: positive)"

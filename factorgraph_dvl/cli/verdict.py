@@ -50,7 +50,9 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         Page of the result.
     """
     from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
-    from factorgraph_dvl.report.entries import entries_table, sum_with_compass
+    from factorgraph_dvl.analysis.mount import mount_in_words
+    from factorgraph_dvl.quality.texts import text_of
+    from factorgraph_dvl.report.entries import MOUNT, entries_table, sum_with_compass
 
     print_verdict(solution.verdict)
     is_usable = solution.verdict.grade != "do not use" and has_instrument_terms(solution)
@@ -61,7 +63,10 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         if both is not None:
             stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)
     if is_usable:
-        print_entries(entries_table(instrument_of(solution), maker))
+        terms = instrument_of(solution)
+        table = entries_table(terms, maker)
+        words = " ".join(map(text_of, mount_in_words(terms.axes)))
+        print_entries(replace(table, caption=f"{MOUNT} {words} {table.caption}"))
     if not events.active():
         stdout().print(f"Open {page}", markup=False, soft_wrap=True)
 

@@ -22,6 +22,7 @@ from factorgraph_dvl.report.tables import GRADES
 from factorgraph_dvl.sensors.dvl import MISALIGNMENT
 
 TITLE = "Enter in your DVL"
+MOUNT = "Mount, by the axes of the record:"
 # Why a value must not be entered, by its grade.
 REFUSED = {
     "red": "σ is more than twice its limit",

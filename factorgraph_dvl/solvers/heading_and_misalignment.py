@@ -16,14 +16,11 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.attitude import HEADING_OFFSET, Attitude, heading_error
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.reported import in_unit
 from factorgraph_dvl.trial import Trial
 
 _MISALIGNMENT = "misalignment_deg"
 # Component of an attitude that is the heading.
 _HEADING = 2
-# Chosen: angle of a mount, deg, up to which its components are angles about axes, to a percent.
-_LARGE_DEG = 15.0
 # Horizontal part of an axis that has a bearing. Chosen: at least one axis has more.
 _LEVEL = 0.5
 # Share of the stated standard deviation of the mean heading error from which on the data do not
@@ -54,15 +51,10 @@ def heading_and_misalignment(trial: Trial, found: SolvedProblem) -> Iterator[Fin
     std, relative_std, error_std = (float(x) for x in np.sqrt(np.diag(P)) / DEG)
     left = error_std / _stated_std(problem, lasting, by_error)
     apart = message("heading_error.undetermined", left=100.0 * left) if left > _UNKNOWN else ""
-    turn = in_unit(parameters[_MISALIGNMENT], values[_MISALIGNMENT]).value
-    angle, key, named = -float(down @ turn), "heading_error.about_the_vertical", {}
-    if np.linalg.norm(turn) > _LARGE_DEG:
-        # A component of a large rotation vector is no angle about its axis.
-        axis, angle = foremost(values[_MISALIGNMENT] @ frd.T)
-        key, named = "heading_error.bearing", {"axis": axis}
+    axis, angle = foremost(values[_MISALIGNMENT] @ frd.T)
     text = message(
-        key,
-        **named,
+        "heading_error.bearing",
+        axis=axis,
         angle=angle,
         std=std,
         relative=angle - mean / DEG,

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.analysis.mount import direction, mount_in_words
+from factorgraph_dvl.quality.texts import text_of
 
 
 def turned(order, angles):
@@ -61,12 +62,16 @@ def turned(order, angles):
     ],
 )
 def test_by_hand(axes, expected):
-    found = mount_in_words(axes)
+    found = list(map(text_of, mount_in_words(axes)))
     assert len(found) == 3
     for part, sentence in zip(expected, found, strict=True):
         assert part in sentence
 
 
 def test_a_direction_between_two_is_that_of_the_nearer():
-    assert direction([np.cos(0.7), np.sin(0.7), 0.0]) == "40.11 deg to starboard of the bow"
-    assert direction([np.cos(0.9), np.sin(0.9), 0.0]).endswith("towards the bow from starboard")
+    def said(angle, language="en"):
+        return text_of(direction(np.array([np.cos(angle), np.sin(angle), 0.0])), language)
+
+    assert said(0.7) == "40.11 deg to starboard of the bow"
+    assert said(0.9).endswith("towards the bow from starboard")
+    assert (said(0.7, "zh"), said(-0.7, "zh")) == ("船首偏右舷 40.11 deg", "船首偏左舷 40.11 deg")

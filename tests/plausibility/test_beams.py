@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.plausibility.dvl import beam_findings
 from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.quality.results import consistency_findings
 from factorgraph_dvl.quality.scale_causes import beam_angles
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams, DvlBeamsSettings
 
@@ -66,3 +68,24 @@ def test_others_are_not():
 )
 def test_ratios_that_another_beam_angle_makes(ratio, angles):
     assert beam_angles(ratio) == angles
+
+
+@pytest.mark.parametrize(
+    ("scale", "text"),
+    [
+        (-1.995, "± 0.002: the sign is reversed"),
+        (-0.316, "the beams look 20 deg from the vertical, and 30 deg were assumed"),
+        (0.462, "the beams look 30 deg from the vertical, and 20 deg were assumed"),
+        (-0.155, "the beams look 25 deg from the vertical, and 30 deg were assumed"),
+        (0.3, "a bed that moves, a false bottom lock, a wrong unit"),
+        (-1.7, "a bed that moves, a false bottom lock, a wrong unit"),
+        (0.03, None),
+    ],
+)
+def test_what_a_scale_error_is_a_sign_of(scale, text):
+    one = np.ones(1)
+    estimate = Estimate(
+        "scale_error", ("scale_error",), scale * one, 2e-3 * one, 0.0 * one, one, one > 0.0
+    )
+    found = [f for f in consistency_findings([estimate], []) if f.code == Code.IMPOSSIBLE_SCALE]
+    assert [text in str(f) for f in found] == ([True] if text else [])

@@ -21,7 +21,7 @@ PACKAGE = Path(factorgraph_dvl.__file__).parent
 KEYS = {f"{group}.{name}" for group, own in catalogue("messages").items() for name in own}
 SOURCES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PACKAGE.rglob("*.py")}
 # Messages inside of others, and those of pages.
-PARTS = {"words", "axes", "campaign", "directions"}
+PARTS = {"words", "axes", "campaign", "directions", "mount"}
 
 
 def fields(template: str) -> set[str]:

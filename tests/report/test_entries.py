@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from html import unescape
+from html import escape, unescape
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +16,11 @@ from running import Run, run
 
 from factorgraph_dvl import load_solution, load_trial, save_trial
 from factorgraph_dvl.analysis.instrument_terms import instrument_of
+from factorgraph_dvl.analysis.mount import mount_in_words
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.quality.texts import chinese
+from factorgraph_dvl.quality.texts import chinese, text_of
 from factorgraph_dvl.report.entries import conventions, entries_of, entries_table
 from factorgraph_dvl.report.files.instrument import instrument_text
 from factorgraph_dvl.report.table import plain
@@ -121,6 +122,12 @@ def test_page_terminal_and_file_have_the_same_numbers(tmp_path: Path, run: Run) 
         assert value == entry.text
         assert cell == f"{value} ± {std}"
         assert content[entry.key] == float(value)
+    # So are the words for the mount.
+    for said in mount_in_words(instrument_of(load_solution(out)).axes):
+        assert text_of(said) in result.out
+        assert text_of(said) in (out / "instrument.yaml").read_text()
+        assert escape(text_of(said)) in verdict
+        assert escape(text_of(said, "zh")) in verdict
     lines = result.out.splitlines()
     assert lines[-1] == f"Open {out}/report.html"
     assert lines.index("Verdict: good") < lines.index(next(x for x in lines if "roll" in x))
@@ -201,7 +208,8 @@ def test_a_result_without_a_dvl_has_nothing_to_enter() -> None:
 
 def test_the_sum_of_mount_and_compass_comes_first() -> None:
     text = message(
-        "heading_error.about_the_vertical",
+        "heading_error.bearing",
+        axis="y",
         angle=-1.5,
         std=0.3,
         relative=-1.4,
@@ -213,6 +221,6 @@ def test_the_sum_of_mount_and_compass_comes_first() -> None:
         own, findings=(Finding(Code.HEADING_ERROR, text, parameter="misalignment_deg"),)
     )
     shown = instrument_text(found)
-    assert "# Mount and compass: about the vertical -1.5" in shown
+    assert "# Mount and compass: the y axis of the DVL points -1.5" in shown
     assert shown.index("Mount and compass") < shown.index("enter_in_dvl")
     assert "Mount and compass" not in instrument_text(own)

@@ -145,6 +145,7 @@ def read_ad2cp(
         elif kind != TEXT:
             losses.skip(f"record 0x{kind:02X}", UNKNOWN_TYPE)
         else:
+            losses.use("text")
             text.append(source[start + 1 : stop].rstrip(b"\0").decode("latin-1"))
         if len(pings) + len(dvl) + len(text) >= block:
             yield Ad2cp(_bottom_track(pings, losses), tracks(dvl), tuple(text))
@@ -504,7 +505,8 @@ FORMATS = (
         "Nortek AD2CP: bottom track (0x17), tracks of DVLs (0x1B, 0x1D), text",
         share,
         read,
-        "one recording (VelEchoBT01), by mhkit; 0x1B and 0x1D by public readers that agree only",
+        "one recording (VelEchoBT01), by mhkit, counts by type by a script; 0x1B and 0x1D by "
+        "public readers that agree only",
         (".ad2cp",),
     ),
 )

@@ -158,11 +158,11 @@ KINDS: dict[Kind, np.dtype[Any]] = {
 }
 
 
-# The field without which a record of a kind says nothing.
-_VALUE: dict[Kind, str] = {
-    **dict.fromkeys(("fix", "transponder", "ins"), "lat"),
-    "course": "speed",
-    "depth": "depth",
+# The fields without one of which a record of a kind says nothing.
+_VALUES: dict[Kind, tuple[str, ...]] = {
+    **dict.fromkeys(("fix", "transponder", "ins"), ("lat", "lon")),
+    "course": ("speed", "course"),
+    "depth": ("depth",),
 }
 
 
@@ -287,13 +287,18 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
     elif batch.kind == "acoustic":
         valueless = ~np.isfinite(records["place"]).all(axis=1)
     elif batch.kind == "topside":
-        valueless = np.isnan(records["lat"]) & np.isnan(records["heading"])
+        valueless = ~has_place(records) & np.isnan(records["heading"])
     elif batch.kind == "attitude":
         valueless = np.isnan(records["roll"]) & np.isnan(records["heading"])
-    elif (name := _VALUE.get(batch.kind)) is not None:
-        valueless = np.isnan(records[name])
+    elif batch.kind in _VALUES:
+        valueless = np.any([np.isnan(records[name]) for name in _VALUES[batch.kind]], axis=0)
         reason = NO_FIX if batch.kind in FIXES else NO_VALUE
     return {NO_TIME: timeless, reason: valueless & ~timeless}
+
+
+def has_place(records: Records) -> NDArray[np.bool_]:
+    """Return which records (N,) have a latitude and a longitude."""
+    return np.asarray(np.isfinite(records["lat"]) & np.isfinite(records["lon"]))
 
 
 def left_out(losses: Losses) -> Batch:

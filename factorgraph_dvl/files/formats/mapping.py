@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import msgspec
+from msgspec.structs import replace
 
 from factorgraph_dvl.files.formats.format import Clock, HeadingReference, Kind
 from factorgraph_dvl.files.formats.velocities import BEAM, EARTH, INSTRUMENT, SHIP
@@ -237,3 +238,16 @@ class MappingSettings(Section, frozen=True, kw_only=True):
         """Return the tables that a file contains, or the topics that a bag does."""
         fits = (table for table in self.tables if fnmatchcase(path.name, table.file))
         return tuple(table for table in fits if bool(table.topic) == topics)
+
+    def source_of(self, table: TableMapping) -> str:
+        """Return the name of the source of a table: its kind, with a number from the second on.
+
+        Tables that differ only in their files, as parts of one record do, are of one source.
+        """
+        sources: list[TableMapping] = []
+        for other in self.tables:
+            source = replace(other, file="")
+            if other.kind == table.kind and source not in sources:
+                sources.append(source)
+        number = sources.index(replace(table, file="")) + 1
+        return table.kind if number == 1 else f"{table.kind} {number}"

@@ -489,7 +489,8 @@ FORMATS = (
         "Teledyne PD0; `.ENX`, `.ENS`, `.ENR`, `.STA`, `.LTA` of VmDas; WinRiver",
         share,
         read,
-        "three recordings (Nenana River, VmDas, WinRiver), by mhkit: velocities to 1e-5 m/s",
+        "three recordings (Nenana River, VmDas, WinRiver), by mhkit: velocities to 1e-5 m/s, "
+        "pings with lock; counts by type by a script",
         (".pd0", ".enx", ".ens", ".enr", ".sta", ".lta", ".000"),
     ),
 )

@@ -62,17 +62,17 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
     """
     settings = None if mapping is None else from_plain(mapping, MappingSettings)
     tables = () if settings is None else settings.of(path)
-    if not tables:
+    if settings is None or not tables:
         raise ConfigError(
             "no mapping says what its columns are",
             where=path.name,
             expected="`--map MAPPING.yaml`",
         )
     for table in tables:
-        yield from _batches(path, table)
+        yield from _batches(path, table, settings.source_of(table))
 
 
-def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
+def _batches(path: Path, table: TableMapping, stream: str) -> Iterator[Batch]:
     source = map_file(path)
     separator = _SEPARATORS[table.separator] if table.separator else separator_of(source)
     names, start = header(source, separator, table.header_lines)
@@ -106,7 +106,7 @@ def _batches(path: Path, table: TableMapping) -> Iterator[Batch]:
             _kind(table),
             out,
             table.time.batch_clock,
-            table.kind,
+            stream,
             table.axes,
             table.heading_reference,
             notes,
@@ -154,8 +154,9 @@ def describe(table: TableMapping) -> Iterator[str]:
     for field in table.columns:
         column = table.column(field)
         unit = column.unit or FIELDS[table.kind][field][2]
+        unit = "" if unit == "1" else f" in {unit}"
         sign = ", sign reversed" if column.sign < 0 else ""
-        yield f"{table.kind}: {field} is column {column.column} in {unit}{sign}"
+        yield f"{table.kind}: {field} is column {column.column}{unit}{sign}"
 
 
 def separator_of(source: Source) -> bytes:
@@ -234,16 +235,18 @@ def _parse(block: bytes, separator: bytes, count: int) -> tuple[pa.Table, list[b
     """Return the rows of a block as text, and those that have another number of cells."""
     if separator == b" ":
         block = re.sub(rb"[ \t]+", b" ", re.sub(rb"(?m)^[ \t]+|[ \t]+(?=\r?$)", b"", block))
+    # The library takes UTF-8 only; what is no number need not be readable.
+    text = block if block.isascii() else block.decode("latin-1").encode()
     dropped: list[bytes] = []
 
     def skip(row: Any) -> str:
-        dropped.append(row.text.encode())
+        dropped.append(row.text.encode("latin-1"))
         return "skip"
 
     names = [str(i) for i in range(count)]
     try:
         table = pyarrow.csv.read_csv(
-            io.BytesIO(block),
+            io.BytesIO(text),
             read_options=pyarrow.csv.ReadOptions(
                 column_names=names, block_size=_BLOCK + _LONGEST_LINE
             ),

@@ -51,15 +51,24 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
     """
     streams = _of_one_transponder(_with_vessel(streams, decisions), decisions)
     others = [t for t in streams if t.stream.kind not in ("acoustic", "topside")]
+    vessel = [t for t in streams if t.stream.kind == "topside"]
     places = merge([t for t in streams if t.stream.kind == "acoustic"], decisions)
     if places is None:
+        for timed in vessel:
+            decisions.add(
+                timed.stream.label, "of a vessel, and no file has places relative to it → not used"
+            )
         return others
-    position = _fullest(streams, "lat", decisions)
-    heading = _fullest(streams, "heading", decisions)
+    position = _fullest(vessel, "lat", decisions)
+    heading = _fullest(vessel, "heading", decisions)
+    used = [t for part in (position, heading) if part is not None for t in part.streams]
+    for timed in vessel:
+        if timed not in used:
+            decisions.add(timed.stream.label, "of the vessel, not used: another one has more")
     if position is None or heading is None:
         lack = "position" if position is None else "heading"
-        decisions.add(
-            places.label, f"no file has the {lack} of the vessel → relative places are not used"
+        decisions.warn(
+            f"{places.label}: no file has the {lack} of the vessel → relative places are not used"
         )
         return others
     decisions.add(
@@ -163,11 +172,7 @@ def _of_one_transponder(streams: Sequence[Timed], decisions: Decisions) -> list[
 
 def _fullest(streams: Sequence[Timed], name: str, decisions: Decisions) -> Merged | None:
     """Return the records of the vessel with the most values of a field, None without."""
-    known = [
-        t
-        for t in streams
-        if t.stream.kind == "topside" and np.isfinite(t.stream.records[:1000][name]).any()
-    ]
+    known = [t for t in streams if np.isfinite(t.stream.records[:1000][name]).any()]
     if not known:
         return None
     return merge([max(known, key=lambda t: t.known)], decisions)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from factorgraph_dvl.files.formats.format import empty
+from factorgraph_dvl.files.formats.format import empty, has_place
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing import motion, orientation, positions, velocity
 from factorgraph_dvl.files.importing.decisions import Decisions
@@ -20,6 +20,15 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.yaml_file import dump_yaml
 from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION, NO_VELOCITY
 
+# Why records of a kind are not used.
+_UNUSED = {
+    "attitude": "attitude: an IMU or a navigation solution says how the vehicle turns",
+    "ins": "navigation solution: there are an IMU and positions",
+    "ins_std": "standard deviations: no navigation solution has them",
+    "course": "course and speed: there are no fixes that they belong to",
+    "dvl": "velocities over the bottom: no ping has lock",
+    "water": "velocities through the water: there are those over the bottom",
+}
 Tables = Callable[[float], Iterator[dict[str, Array]]]
 SUFFIX = ".parquet"
 # Chosen: priors of misalignment, deg, and of lever arms, m. Tilt sensors inside a DVL are aligned
@@ -111,8 +120,9 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
         under_water = gnss.fixes.streams[0].stream.kind == "transponder"
         add = _add_usbl if under_water else _add_gnss
         add(out, gnss, imu is not None or ins is not None)
+    deviations = None if ins is None else motion.choose(streams, "ins_std", decisions)
     if ins is not None:
-        _add_ins(out, ins, motion.choose(streams, "ins_std", decisions))
+        _add_ins(out, ins, deviations)
     log = velocity.choose(streams, decisions)
     if attitude is not None:
         _add_attitude(out, attitude, _clock_of(attitude, log, gnss))
@@ -125,6 +135,12 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     depth = motion.choose(streams, "depth", decisions)
     if depth is not None:
         out.add("depth", lambda zero: motion.depth_tables(depth, zero), std_m=0.1)
+    chosen = [imu, ins] if attitude is None else [attitude.attitude]
+    chosen += [] if gnss is None else [gnss.fixes, gnss.courses]
+    chosen += [deviations, depth] if log is None else [deviations, depth, log.pings]
+    used = [part for part in chosen if part is not None]
+    _say_unused(streams, used, decisions)
+    _say_apart(used, decisions)
     if gnss is None and ins is None:
         decisions.lack(NO_POSITION)
     if log is None:
@@ -166,14 +182,33 @@ def _place(
     gnss: positions.Positions | None, streams: Sequence[Timed]
 ) -> tuple[float, float] | None:
     """Return a latitude and longitude of the trial, rad."""
-    if gnss is not None:
-        part = gnss.fixes.sample
-        return float(np.nanmedian(part["lat"])), float(np.nanmedian(part["lon"]))
-    for timed in streams:
-        if timed.stream.kind == "ins":
-            part = timed.stream.records[:1000]
-            return float(np.nanmedian(part["lat"])), float(np.nanmedian(part["lon"]))
+    parts = [] if gnss is None else [gnss.fixes.sample]
+    parts += [timed.stream.records[:1000] for timed in streams if timed.stream.kind == "ins"]
+    for part in parts:
+        known = part[has_place(part)]
+        if len(known):
+            return float(np.median(known["lat"])), float(np.median(known["lon"]))
     return None
+
+
+def _say_apart(used: Sequence[Merged], decisions: Decisions) -> None:
+    """Warn of records that have no time in common with the first ones, of the motion."""
+    for other in used[1:]:
+        (begin, end), (start, stop) = (part.sample_time[[0, -1]] for part in (used[0], other))
+        if start > end or stop < begin:
+            decisions.warn(f"{other.label}: no time in common with {used[0].label}")
+
+
+def _say_unused(streams: Sequence[Timed], used: Sequence[Merged], decisions: Decisions) -> None:
+    """Say of the kinds of which nothing is used why; of others `best_source` says it."""
+    kinds = {timed.stream.kind for part in used for timed in part.streams}
+    labels = {timed.stream.label for part in used for timed in part.streams}
+    for timed in streams:
+        kind, label = timed.stream.kind, timed.stream.label
+        # A navigation solution beside an IMU may be used as fixes.
+        is_used = kind in kinds or (kind == "ins" and label in labels)
+        if timed.known and kind in _UNUSED and not is_used:
+            decisions.add(label, f"{_UNUSED[kind]} → not used")
 
 
 def _add_usbl(out: Assembly, fixes: positions.Positions, has_body: bool) -> None:

@@ -74,8 +74,8 @@ def describe_axes(merged: Merged, decisions: Decisions) -> None:
         decisions.add(merged.label, "it looks up: axes are turned over by 180° about forward")
     sound = pings["sound_speed"][np.isfinite(pings["sound_speed"])]
     if len(sound):
-        low, high = float(sound.min()), float(sound.max())
-        value = f"{low:.0f} m/s" if low == high else f"{low:.0f} to {high:.0f} m/s"
+        ends = dict.fromkeys(f"{speed:.0f}" for speed in (sound.min(), sound.max()))
+        value = f"{' to '.join(ends)} m/s"
         decisions.add(
             merged.label,
             f"velocities were made with a sound speed of {value} → kept; an error of it is in "

@@ -6,6 +6,7 @@ import glob
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,29 @@ _UNITS = (
 _INVALID = (-32768.0, -32.768, 88.888, 999.0, 9999.0, 99999.0, -999.0, -9999.0)
 
 
+@dataclass(frozen=True)
+class _Table:
+    """A table: the lines of its mapping that all kinds share, and what its columns are.
+
+    Parameters
+    ----------
+    file, time : str
+        Lines of the mapping.
+    names : list of str
+        Names of its columns.
+    columns : ndarray, shape (N, n)
+        Their values.
+    fields : dict of str to (int, str)
+        Columns by field, with the unit that its name states.
+    """
+
+    file: str
+    time: str
+    names: list[str]
+    columns: Array
+    fields: dict[str, tuple[int, str]]
+
+
 def guess(path: Path) -> str:
     """Propose a mapping of one table.
 
@@ -83,7 +107,7 @@ def guess(path: Path) -> str:
     Returns
     -------
     str
-        An entry of `tables` in a mapping YAML; comments say what came from the data.
+        Entries of `tables` in a mapping YAML; comments say what came from the data.
 
     Raises
     ------
@@ -106,16 +130,35 @@ def guess(path: Path) -> str:
             expected="a line of names, such as `time_s,vel_x_m_s,vel_y_m_s,vel_z_m_s`",
             hint=f"Found {', '.join(names[:20])}; write the mapping by hand",
         )
-    lines = [f"  - file: {_quoted(glob.escape(as_text(path.name)))}", f"    kind: {kind}"]
-    lines.append(f"    time: {_time(names, columns, time, iso)}")
+    table = _Table(
+        f"  - file: {_quoted(glob.escape(as_text(path.name)))}",
+        f"    time: {_time(names, columns, time, iso)}",
+        names,
+        columns,
+        fields,
+    )
+    text = _entry(table, kind)
+    # A log of velocities may have a compass and tilt sensors of its own.
+    return text + _entry(table, "attitude") if kind == "dvl" and "heading" in fields else text
+
+
+def _entry(table: _Table, kind: Kind) -> str:
+    """Return the entry of the records of a kind in a table."""
+    names, columns, fields = table.names, table.columns, dict(table.fields)
+    lines = [table.file, f"    kind: {kind}", table.time]
     if kind == "imu":
         lines.append(f"    axes: {_axes(columns[:, fields['accel_z'][0]])}")
     if kind == "dvl":
         lines.append("    # axes: FRD  # forward, right, down; or RFU, FLU: not in the table")
     if kind == "ins" and "height" not in fields:
         fields["height"] = fields["altitude"]
-    if kind == "attitude" and "true" in names[fields["heading"][0]].lower():
-        lines.append('    heading: "true"  # by its name; else magnetic, or unknown')
+    if kind == "attitude":
+        if "true" in names[fields["heading"][0]].lower():
+            lines.append('    heading: "true"  # by its name; else magnetic, or unknown')
+        if "roll" in fields and _is_turned_over(columns[:, fields["roll"][0]], fields["roll"][1]):
+            lines.append("    # roll is near 180°, of a sensor that is upside down: left out")
+            del fields["roll"]
+            fields.pop("pitch", None)
     if kind == "dvl" and "beam1" in fields:
         lines.append("    coordinates: beam")
         lines.append("    beam_angle_deg: 30  # from the vertical: not in the table")
@@ -132,6 +175,12 @@ def guess(path: Path) -> str:
         index, unit = fields["vel_down"]
         lines.append(f"      vel_u: {{column: {_quoted(names[index])}, unit: {unit}, sign: -1}}")
     return "\n".join(lines) + "\n"
+
+
+def _is_turned_over(roll: Array, unit: str) -> bool:
+    """Return whether most rolls are those of a sensor upside down."""
+    upright = 0.75 * np.pi if unit == "rad" else 135.0
+    return bool(np.nanmedian(np.abs(roll)) > upright)
 
 
 def guess_all(paths: Sequence[Path]) -> str:

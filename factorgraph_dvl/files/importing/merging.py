@@ -213,7 +213,9 @@ class _Intervals:
         gaps = np.concatenate(self._gaps)
         if not len(gaps):
             return ""
+        if len(gaps) == 1:
+            return f"1 gap of {gaps[0]:.3g} s"
         return (
-            f"{len(gaps)} gaps longer than {self._limit:.3g} s, {gaps.sum():.0f} s in all, the "
-            f"longest {gaps.max():.0f} s"
+            f"{len(gaps)} gaps longer than {self._limit:.3g} s, {gaps.sum():.3g} s in all, the "
+            f"longest {gaps.max():.3g} s"
         )

@@ -9,7 +9,7 @@ import numpy as np
 
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing.decisions import Decisions
-from factorgraph_dvl.files.importing.merging import SAMPLE, Beside, Merged, merge
+from factorgraph_dvl.files.importing.merging import Beside, Merged, merge
 from factorgraph_dvl.files.importing.positions import best_source
 from factorgraph_dvl.files.importing.time_base import Timed
 from factorgraph_dvl.files.motion_table import COLUMNS, STD_COLUMNS
@@ -34,8 +34,8 @@ def choose_imu(streams: Sequence[Timed], decisions: Decisions) -> Merged | None:
     imu = choose(streams, "imu", decisions)
     if imu is None or imu.count < 2:
         return imu
-    time = imu.streams[0].time[:SAMPLE]
-    step = float(np.nanmedian(np.diff(time)))
+    time = imu.sample_time
+    step = float(np.median(np.diff(time))) * len(time) / imu.count
     others = [t.stream.label for t in streams if t.stream.kind in ("attitude", "ins") and t.known]
     if step <= _SLOWEST_IMU or not others:
         return imu

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factorgraph_dvl.files.formats.format import FIXES
+from factorgraph_dvl.files.formats.format import FIXES, has_place
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import SAMPLE, Beside, Merged, merge
@@ -125,6 +125,9 @@ def choose(streams: Sequence[Timed], decisions: Decisions) -> Positions | None:
     fixes = merge(best_source(streams, FIXES, _rank_of_fixes, decisions), decisions)
     if fixes is None:
         return None
+    if not any(has_place(part).any() for _, part in fixes.chunks()):
+        decisions.add(fixes.label, "no record has a position → not used")
+        return None
     courses = merge(best_source(streams, ("course",), _count, decisions), decisions)
     height = _height(fixes, decisions)
     _describe(fixes, courses, decisions)
@@ -156,17 +159,20 @@ def _count(source: Sequence[Timed]) -> tuple[float, ...]:
 
 def _rank_of_fixes(source: Sequence[Timed]) -> tuple[float, ...]:
     parts = [timed.stream.records[:SAMPLE] for timed in source]
+    has_any = any(has_place(part).any() for part in parts)
     is_measured = any((part["quality"] != _ESTIMATED).any() for part in parts)
     has_std = any(np.isfinite(part["std"]).any() for part in parts)
     has_height = any(np.isfinite(part[n]).any() for part in parts for n in ("height", "altitude"))
-    return (float(is_measured), float(has_std), float(has_height), *_count(source))
+    ranks = (has_any, is_measured, has_std, has_height)
+    return (*map(float, ranks), *_count(source))
 
 
 def _height(fixes: Merged, decisions: Decisions) -> str:
     part = fixes.sample
     if np.isfinite(part["height"]).mean() > 0.5:
-        if np.isfinite(part["altitude"]).any():
-            separation = float(np.nanmedian(part["height"] - part["altitude"]))
+        separations = part["height"] - part["altitude"]
+        if np.isfinite(separations).any():
+            separation = float(np.nanmedian(separations))
             decisions.add(
                 fixes.label,
                 f"heights: altitude above the geoid plus its separation ({separation:.1f} m) → "
@@ -191,9 +197,10 @@ def _height(fixes: Merged, decisions: Decisions) -> str:
 def _describe(fixes: Merged, courses: Merged | None, decisions: Decisions) -> None:
     part = fixes.sample
     known = np.isfinite(part["std"]).all(axis=1)
-    qualities = sorted({int(q) for q in part["quality"][np.isfinite(part["quality"])]})
+    stated = part["quality"][np.isfinite(part["quality"]) & has_place(part)]
+    qualities = sorted({int(quality) for quality in stated})
     source = "stated in the file" if known.any() else "typical of the quality of the fix"
-    count = sum(int(np.isfinite(found["lat"]).sum()) for _, found in fixes.chunks())
+    count = sum(int(has_place(found).sum()) for _, found in fixes.chunks())
     text = f"{count} fixes; standard deviations {source}"
     if qualities:
         text += f" (quality {', '.join(map(str, qualities))})"

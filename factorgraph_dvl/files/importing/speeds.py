@@ -1,4 +1,4 @@
-"""Speeds in raw files: over ground by GNSS, and by velocity logs."""
+"""Speeds in raw files, over ground by GNSS and by velocity logs; and rates of turning."""
 
 from __future__ import annotations
 
@@ -45,6 +45,39 @@ def log_speed(streams: Sequence[Stream]) -> Series | None:
                 if len(series[0]) > 1:
                     return series
     return None
+
+
+def turn_rate(streams: Sequence[Stream], times: Sequence[Stored | None]) -> Series | None:
+    """Return stamps and rates of the heading, rad/s, of what has most of them; None if nothing.
+
+    Parameters
+    ----------
+    streams : sequence of Stream
+        Streams of all kinds.
+    times : sequence of Stored or None
+        Their times (N,), s; None for their own stamps.
+    """
+    found = []
+    for stream, time in zip(streams, times, strict=True):
+        if stream.kind in ("attitude", "ins"):
+            headings = (part["heading"] for part in stream.records.chunks())
+            own = (part["time"] for part in stream.records.chunks())
+            stamps = own if time is None else time.chunks()
+            found.append(_rate(*_joined(zip(stamps, headings, strict=True), stream)))
+    found = [series for series in found if len(series[0]) > 1]
+    return max(found, key=lambda series: len(series[0])) if found else None
+
+
+def _rate(time: Array, heading: Array) -> Series:
+    """Return times and rates of headings (N,) over a second, in which noise is small."""
+    if len(time) < 2:
+        return time[:0], heading[:0]
+    step = max(1.0, (time[-1] - time[0]) / _MOST)
+    grid = np.arange(time[0], time[-1], step)
+    rate = np.diff(np.interp(grid, time, np.unwrap(heading))) / step
+    place = np.clip(np.searchsorted(time, grid[1:]), 1, len(time) - 1)
+    near = np.diff(time)[place - 1] <= _LONGEST_STEP
+    return grid[:-1][near] + step / 2.0, rate[near]
 
 
 def _over_ground(stream: Stream, times: Stored) -> Iterator[Series]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
@@ -159,6 +159,7 @@ class Spool:
             self._note(file, note)
         if not len(batch.records):
             return
+        batch = replace(batch, records=_without_infinity(batch.records))
         tally = self._tallies.setdefault((file, batch.type), Tally())
         bad = np.zeros(len(batch.records), bool)
         for reason, found in faults(batch).items():
@@ -226,3 +227,14 @@ class Spool:
     def _new(self) -> Path:
         self._stored += 1
         return self._folder / str(self._stored)
+
+
+def _without_infinity(records: Records) -> Records:
+    """Return records with nan in place of infinite values, as which damaged bytes are read."""
+    out = records
+    for name in records.dtype.names or ():
+        infinite = np.isinf(records[name])
+        if infinite.any():
+            out = records.copy() if out is records else out
+            out[name][infinite] = np.nan
+    return out

@@ -12,7 +12,7 @@ from factorgraph_dvl.files.formats.clocks import GPS_EPOCH, gps_to_utc, in_order
 from factorgraph_dvl.files.formats.format import FIXES
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.lag import lag_between
-from factorgraph_dvl.files.importing.speeds import ground_speed, log_speed
+from factorgraph_dvl.files.importing.speeds import ground_speed, log_speed, turn_rate
 from factorgraph_dvl.files.importing.spool import CHUNK, Spool, Stored, Stream
 from factorgraph_dvl.geometry.units import DAY
 from factorgraph_dvl.geometry.vectors import Array
@@ -106,18 +106,24 @@ def on_utc(streams: Sequence[Stream], spool: Spool, decisions: Decisions) -> lis
     dated = {
         id(s): Timed.of(s, _dated(s, near, decisions), spool) for s in streams if s.clock != "own"
     }
-    out = []
-    offsets: dict[str, _Offset] = {}
-    for stream in streams:
-        if stream.clock != "own":
-            out.append(dated[id(stream)])
-            continue
-        if stream.file not in offsets:
-            offsets[stream.file] = _offset(stream.file, streams, dated, decisions)
-        offset = offsets[stream.file]
-        times = (part["time"] - offset.value for part in stream.records.chunks())
-        out.append(Timed.of(stream, times, spool, offset.std, offset.rate_std))
-    return out
+    own = {s.file: [t for t in streams if t.file == s.file and t.clock == "own"] for s in streams}
+    pairs = {file: _pairs(file, own[file], streams, dated) for file in own if own[file]}
+
+    def precedence(file: str) -> tuple[bool, bool]:
+        return len(pairs[file][0]) < 2, not any(s.kind in FIXES for s in own[file])
+
+    # Files that have UTC, then others with positions: the rest is compared with these.
+    for file in sorted(pairs, key=precedence):
+        interval = _interval(own[file])
+        if len(pairs[file][0]) >= 2:
+            offset = _from_pairs(file, *pairs[file], interval, decisions)
+        else:
+            known = [(s, dated[id(s)].time) for s in streams if id(s) in dated]
+            offset = _from_content(file, own[file], known, interval, decisions)
+        for stream in own[file]:
+            times = (part["time"] - offset.value for part in stream.records.chunks())
+            dated[id(stream)] = Timed.of(stream, times, spool, offset.std, offset.rate_std)
+    return [dated[id(stream)] for stream in streams]
 
 
 def _some_date(streams: Sequence[Stream]) -> float | None:
@@ -164,20 +170,6 @@ def _days(times: Iterable[Array], near: float) -> Iterator[Array]:
         if len(known):
             near = float(out[known[-1]])
         yield out
-
-
-def _offset(
-    file: str,
-    streams: Sequence[Stream],
-    dated: Mapping[int, Timed],
-    decisions: Decisions,
-) -> _Offset:
-    own = [s for s in streams if s.file == file and s.clock == "own"]
-    interval = _interval(own)
-    received, utc = _pairs(file, own, streams, dated)
-    if len(received) >= 2:
-        return _from_pairs(file, received, utc, interval, decisions)
-    return _from_content(file, own, streams, dated, interval, decisions)
 
 
 def _interval(own: Sequence[Stream]) -> float:
@@ -242,45 +234,55 @@ def _from_pairs(
 def _from_content(
     file: str,
     own: Sequence[Stream],
-    streams: Sequence[Stream],
-    dated: Mapping[int, Timed],
+    known: Sequence[tuple[Stream, Stored]],
     interval: float,
     decisions: Decisions,
 ) -> _Offset:
-    """Return the offset at which speeds agree, or zero where stamps can be taken as they are."""
+    """Return the offset at which speeds or turns agree with those of streams with known times.
+
+    Zero where stamps can be taken as they are.
+    """
     stamps = np.concatenate([s.records.thinned(_MOST_PAIRS)["time"] for s in own])
     stamps = stamps[np.isfinite(stamps)]
     has_dates = len(stamps) > 0 and bool(np.median(stamps) >= FIRST_DATE)
-    ground = ground_speed([(s, dated[id(s)].time) for s in streams if id(s) in dated])
-    through = log_speed(own)
+    ground = ground_speed(known)
     if ground is None:
         decisions.add(file, "no file has UTC to compare its clock with → taken as UTC")
         return _Offset(0.0, _UNCOMPARED)
-    found = None if through is None else lag_between(through, ground, zones=has_dates)
-    if found is not None and found.clear:
-        decisions.add(
-            file,
-            f"its clock is {found.lag:+.1f} s from UTC where its speeds agree with those of GNSS "
-            f"(correlation {found.peak:.2f}, next best {found.second:.2f}) → stamps less that",
-            "dvl.time_offset_std_s",
-        )
-        return _Offset(found.lag, max(_LATENCY, interval))
+    found = None
+    for what, first, second in (
+        ("speeds", log_speed(own), ground),
+        ("turns", turn_rate(own, [None] * len(own)), turn_rate(*zip(*known, strict=True))),
+    ):
+        if first is None or second is None:
+            continue
+        lag = lag_between(first, second, zones=has_dates)
+        if lag is not None and lag.clear:
+            clock = f"is {lag.lag:+.1f} s from UTC"
+            if lag.lag < -FIRST_DATE:
+                clock = f"starts at {_iso(-lag.lag)} UTC"
+            decisions.add(
+                file,
+                f"its clock {clock} where its {what} agree with those of other files (correlation "
+                f"{lag.peak:.2f}, next best {lag.second:.2f}) → stamps less that",
+                "dvl.time_offset_std_s",
+            )
+            return _Offset(lag.lag, max(_LATENCY, interval))
+        found = lag if found is None else found
+    text = "there are no speeds or turns to compare"
+    if found is not None:
+        text = "no lag of speeds or turns is clear "
+        text += f"(correlation {found.peak:.2f}, next best {found.second:.2f})"
     overlap = len(stamps) > 0 and stamps.min() <= ground[0][-1] and stamps.max() >= ground[0][0]
-    peak = "there is no speed to compare" if found is None else f"correlation {found.peak:.2f}"
     if has_dates and overlap:
         decisions.add(
             file,
-            f"its stamps overlap with those of GNSS, and {peak} → taken as UTC",
+            f"its stamps overlap with those of GNSS, and {text} → taken as UTC",
             "dvl.time_offset_std_s",
         )
         return _Offset(0.0, _UNCOMPARED)
     raise DataError(
-        "its clock cannot be related to that of GNSS: stamps do not overlap, and "
-        + (
-            peak
-            if found is None
-            else f"no lag of the speeds is clear ({peak}, next best {found.second:.2f})"
-        ),
+        f"its clock cannot be related to that of GNSS: stamps do not overlap, and {text}",
         where=file,
         expected="files of the same time, or a file with both clocks",
     )

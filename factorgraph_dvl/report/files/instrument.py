@@ -20,6 +20,7 @@ from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import printable
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.notation import at_precision, fixed, sentence
+from factorgraph_dvl.quality.texts import text_of
 from factorgraph_dvl.quality.verdict import Grade, Verdict
 from factorgraph_dvl.report.entries import (
     RECORDED_AXES,
@@ -84,7 +85,7 @@ def instrument_text(calibration: Calibration | Solution) -> str:
         ),
         "",
         "# The mount, with the axes of the DVL as they were recorded:",
-        *(f"# {sentence}" for sentence in mount_in_words(i.axes)),
+        *(f"# {text_of(sentence)}" for sentence in mount_in_words(i.axes)),
         *_further(i),
     ]
     return verdict_text(calibration.verdict) + "\n".join(lines) + "\n"

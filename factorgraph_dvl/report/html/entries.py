@@ -5,7 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms, instrument_of
-from factorgraph_dvl.report.entries import TITLE, conventions, entries_table, sum_with_compass
+from factorgraph_dvl.analysis.mount import mount_in_words
+from factorgraph_dvl.quality.texts import text_of
+from factorgraph_dvl.report.entries import (
+    MOUNT,
+    TITLE,
+    conventions,
+    entries_table,
+    sum_with_compass,
+)
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import Html, both, described, element, joined, paragraph
 from factorgraph_dvl.report.html.vessel import vessel_drawing
@@ -20,6 +28,8 @@ def entries_content(result: Result) -> Iterator[Html]:
     terms = instrument_of(result.solution)
     if (found := sum_with_compass(result.solution.findings)) is not None:
         yield paragraph(joined(both("Mount and compass:"), both(str(found), found.chinese)))
+    mount = (both(text_of(said), text_of(said, "zh")) for said in mount_in_words(terms.axes))
+    yield paragraph(joined(both(MOUNT), *mount))
     drawing = vessel_drawing(terms, result.solution, result.run.get("settings", {}))
     yield element(
         "div",

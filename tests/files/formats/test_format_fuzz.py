@@ -21,7 +21,7 @@ TESTS = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("count", [40, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [50, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", OWN)
 def test_damaged_input(name, count):
     found = run(name, count, 11)

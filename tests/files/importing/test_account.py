@@ -31,7 +31,8 @@ from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.vectors import rotate
 
-RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "data" / "recordings"
+DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
+RECORDINGS = DATA / "recordings"
 
 
 def gga(i, quality=1):
@@ -166,10 +167,10 @@ def test_the_table_is_an_event(tmp_path, run):  # noqa: F811
 class TestRecordings:
     """Counts by type against decoders of others, on recordings outside this repository."""
 
-    def accounted(self, tmp_path, name):
-        if not (RECORDINGS / name).is_file():
+    def accounted(self, tmp_path, name, folder=RECORDINGS):
+        if not (folder / name).is_file():
             pytest.skip(f"no recording {name}")
-        decisions = import_files([RECORDINGS / name], tmp_path / "trial")
+        decisions = import_files([folder / name], tmp_path / "trial")
         return {kind: (read, skipped) for kind, read, skipped, _ in decisions.accounts[0].rows()}
 
     def test_nucleus(self, tmp_path):
@@ -199,6 +200,71 @@ class TestRecordings:
             name: counts[kind] for name, kind in kinds.items()
         }
         assert found["IMU (imu)"] == (17_773, 0)
+
+    @pytest.mark.parametrize(
+        ("name", "by_mhkit"),
+        [
+            # Of mhkit 1.1.2: pings, and those with bottom lock. It leaves out the last ping of
+            # what WinRiver wrote, and most sentences.
+            ("nenana_river/nenana_2010-09-23.PD0", (830, 610)),
+            ("adcp_raw/winriver01.PD0", (261, 261)),
+            ("adcp_raw/vmdas01_wh.ENX", (3713, 0)),
+        ],
+    )
+    def test_pd0(self, tmp_path, name, by_mhkit):
+        found = self.accounted(tmp_path, Path(name).name, (DATA / name).parent)
+        data, at = (DATA / name).read_bytes(), 0
+        types, last, locked = Counter(), False, 0
+        while (at := data.find(b"\x7f\x7f", at)) >= 0:
+            size = int.from_bytes(data[at + 2 : at + 4], "little")
+            part = data[at : at + size + 2]
+            if len(part) < size + 2 or sum(part[:size]) % 65536 != int.from_bytes(
+                part[size:], "little"
+            ):
+                at += 1
+                continue
+            at, last = at + size + 2, False
+            for start in np.frombuffer(part, "<u2", part[5], 6):
+                kind = int.from_bytes(part[start : start + 2], "little")
+                types[kind] += 1
+                if kind == 0x0600:
+                    last = (np.frombuffer(part, "<i2", 3, start + 24) != -32768).all()
+            locked += last
+        pings = types[0x0000]
+        lost = int(0x2022 in types)
+        assert by_mhkit == (pings - lost, locked - lost * last)
+        assert sum(found["leader (attitude)"]) == sum(found["cells (water)"]) == pings
+        if 0x0600 in types:
+            assert found["bottom (dvl)"] == (locked, pings - locked)
+        sentences = sum(sum(found.get(n, (0, 0))) for n in ("GGA (fix)", "VTG (course)"))
+        # 0x2022 has any sentence; 0x2101 and 0x2102 are GGA and VTG; 0x2000 has two fixes.
+        assert sentences == types[0x2022] + types[0x2101] + types[0x2102]
+        assert sum(found.get("VmDas (fix)", (0, 0))) == 2 * types[0x2000]
+
+    def test_ad2cp(self, tmp_path):
+        found = self.accounted(tmp_path, "VelEchoBT01.ad2cp", DATA / "adcp_raw")
+        data, at, types = (DATA / "adcp_raw" / "VelEchoBT01.ad2cp").read_bytes(), 0, Counter()
+        while 0 <= (at := data.find(b"\xa5\x0a", at)) <= len(data) - 10:
+            words = np.frombuffer(data, "<u2", 5, at)
+            stop = at + 10 + int(words[2])
+            if (int(words[:4].sum()) + 0xB58C) % 65536 == words[4] and stop <= len(data):
+                types[data[at + 2]] += 1
+                at = stop
+            else:
+                at += 1
+        names = {
+            "bottom (dvl)": 0x17,
+            "leader (attitude)": 0x17,
+            "record 0x18": 0x18,
+            "record 0x15": 0x15,
+            "record 0x1C": 0x1C,
+            "text": 0xA0,
+        }
+        assert {name: sum(count) for name, count in found.items()} == {
+            name: types[kind] for name, kind in names.items()
+        }
+        # Of mhkit 1.1.2: `vel_bt`, and none of them with lock.
+        assert found["bottom (dvl)"] == (0, 159)
 
     def test_water_linked(self, tmp_path):
         found = self.accounted(tmp_path, "water_linked_a50.json")

@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from truth import config
 
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.files.formats.clocks import utc_to_gps
 from factorgraph_dvl.files.importing.raw_files import import_files
+from factorgraph_dvl.files.tables import read_table
 from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.geometry.units import DAY, DEG
+from factorgraph_dvl.settings.yaml_file import read_yaml
 from factorgraph_dvl.simulation import simulate
 
 START, BOOT, LATE = 1_700_000_000.0, 55.0, 0.03
@@ -46,14 +49,105 @@ def telemetry(trial):
 
 def test_the_log_of_the_dvl_is_better_than_what_the_vehicle_made_of_it(tmp_path):
     pytest.importorskip("pymavlink")
-    (tmp_path / "a.tlog").write_bytes(logs.telemetry_trial())
     utc = 1586044800 + 345600 - 18
+    (tmp_path / "a.tlog").write_bytes(logs.telemetry_trial(start=utc))
     rows = (f"{utc + 0.1 * i},1.0,0.0,0.0,0.01,1" for i in range(40))
     table = "\n".join(["timestamp,vx,vy,vz,fom,velocity_valid", *rows])
     (tmp_path / "dvl.csv").write_text(table)
     decisions = import_files([tmp_path / "a.tlog", tmp_path / "dvl.csv"], tmp_path / "trial")
     assert "left out: it repeats the DVL's own log, dvl.csv" in decisions.text("")
     np.testing.assert_allclose(load_trial(tmp_path / "trial").dvl.velocity, [[1, 0, 0]] * 40)
+
+
+def turning_logs(shift, seconds=300):
+    """Return a .BIN with the time since its start, and a .tlog with GPS_INPUT, of one drive.
+
+    What both have in common is how the vehicle turns; the .BIN started `shift` s after the Epoch.
+    """
+
+    rates = np.random.default_rng(3).normal(0.0, 5.0, 2000)
+    turned = np.cumsum(np.convolve(rates, np.ones(4) / 2.0, "same"))
+
+    def heading(t):
+        return np.interp(t, np.arange(2000.0), turned)
+
+    binary = []
+    for i in range(12 * seconds):
+        t = 20.0 + i / 12.0
+        us = round(t * 1e6)
+        binary.append(("IMU", us, 0, 0.1, 0.2, 0.3, 1.0, 2.0, -9.8))
+        if i % 3 == 0:
+            yaw = round(100.0 * (heading(t + shift - START) % 360.0))
+            binary.append(("ATT", us, 0, 0, 0, 0, 0, yaw))
+    data = b""
+    for i in range(4 * seconds):
+        at = 0.25 * i
+        own, yaw = round(1e3 * (100.0 + at)), np.deg2rad(heading(at))
+        arrival = START + at + 0.02
+        yaw = float(np.angle(np.exp(1j * yaw)))
+        data += logs.telemetry("ATTITUDE", arrival, own, 0.0, 0.0, yaw, 0, 0, 0)
+        if i % 4 == 0:
+            place = (540000001 + 40 * i, -30000002)
+            given = (0, 0, *place, -4.5, 1.0, 1.0, 0.0, 0.0, 0.0, 0.4, 1.5, 2.5)
+            data += logs.telemetry("GPS_INPUT", arrival, *given, 16, 0, 0, 3, 10, sender=(1, 220))
+    return logs.ardupilot_log(binary), data
+
+
+@pytest.mark.parametrize("order", [("a.BIN", "a.tlog"), ("a.tlog", "a.BIN")])
+def test_a_log_without_a_date_is_related_by_how_the_vehicle_turns(tmp_path, order):
+    pytest.importorskip("pymavlink")
+    shift = START + 31.3
+    names = dict(zip(("a.BIN", "a.tlog"), turning_logs(shift), strict=True))
+    for name, data in names.items():
+        (tmp_path / name).write_bytes(data)
+    decisions = import_files([tmp_path / name for name in order], tmp_path / "trial")
+    text = decisions.text("")
+    assert f"a.BIN: its clock starts at {np.datetime64(int(shift), 's')}" in text
+    assert "where its turns agree with those of other files" in text
+    assert "a.BIN ATT[0]: attitude: an IMU or a navigation solution says how" in text
+    time = read_table(tmp_path / "trial" / "imu.parquet", ("time_s",))["time_s"]
+    epoch = read_yaml(tmp_path / "trial" / "trial.yaml", dict)["epoch"]
+    first = np.datetime64(epoch.removesuffix("Z"), "s").astype(float) + time[0]
+    assert first == pytest.approx(20.0 + shift, abs=0.2)
+
+
+def test_speeds_are_compared_with_positions_that_have_no_utc(tmp_path):
+    """The DVL counts from its start; GPS_INPUT states no GPS time: it has that of a computer."""
+    pytest.importorskip("pymavlink")
+    speed = np.abs(np.cumsum(np.random.default_rng(4).normal(0.0, 0.3, 600)))
+    metres = np.concatenate([[0.0], np.cumsum(speed)])
+    data = b""
+    for t in range(500):
+        place = (540000000 + round(metres[t] / 6.371e6 / DEG * 1e7), -30000002)
+        given = (0, 0, *place, -4.5, 1.0, 1.0, 0.0, 0.0, 0.0, 0.4, 0.5, 0.5)
+        at = START + t
+        data += logs.telemetry("GPS_INPUT", at, *given, 16, 0, 0, 3, 10, sender=(1, 220))
+        data += logs.telemetry("ATTITUDE", at, 1000 * t, 0.0, 0.0, 0.0, 0, 0, 0)
+    (tmp_path / "a.tlog").write_bytes(data)
+    # Half a second after each fix, the DVL has the mean speed until the next one.
+    rows = (f"{t + 0.5 - 80.0},{speed[t]:.4f},0.0,0.0,0.01,1" for t in range(100, 400))
+    table = "\n".join(["timestamp,vx,vy,vz,fom,velocity_valid", *rows])
+    (tmp_path / "dvl.csv").write_text(table)
+    decisions = import_files([tmp_path / "dvl.csv", tmp_path / "a.tlog"], tmp_path / "trial")
+    assert "dvl.csv: its clock starts at" in decisions.text("")
+    assert "where its speeds agree with those of other files" in decisions.text("")
+    time = read_table(tmp_path / "trial" / "dvl.parquet", ("time_s",))["time_s"]
+    epoch = read_yaml(tmp_path / "trial" / "trial.yaml", dict)["epoch"]
+    first = np.datetime64(epoch.removesuffix("Z"), "s").astype(float) + time[0]
+    assert first == pytest.approx(START + 100.5, abs=0.3)
+
+
+def test_a_log_of_another_dive_is_refused(tmp_path):
+    """Its stamps are no dates: taken as UTC, they would be in 1970."""
+    pytest.importorskip("pymavlink")
+    binary, _ = turning_logs(START + 1000.0, 100)
+    _, telemetry_ = turning_logs(START, 100)
+    (tmp_path / "a.BIN").write_bytes(binary)
+    (tmp_path / "a.tlog").write_bytes(telemetry_)
+    with pytest.raises(
+        DataError, match=r"a\.BIN: its clock cannot be related.*no lag of speeds or"
+    ):
+        import_files([tmp_path / "a.BIN", tmp_path / "a.tlog"], tmp_path / "trial")
 
 
 def test_a_vehicle_comes_back_from_its_telemetry(tmp_path):

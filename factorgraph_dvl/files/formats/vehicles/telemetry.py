@@ -148,7 +148,7 @@ def read(path: Path, mapping: Mapping[str, Any] | None = None) -> Iterator[Batch
             yield from _converted(gathered)
             gathered, waiting = {}, 0
     yield from _converted(gathered)
-    notes = (_REPEATED,) if repeats else ()
+    notes = (_REPEATED,) if repeats and _GPS_RAW in losses.skipped else ()
     yield replace(left_out(losses), notes=notes)
 
 
