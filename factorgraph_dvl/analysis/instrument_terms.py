@@ -13,10 +13,12 @@ from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3, frd_from_body, wrapped
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.quality.verdict import Grade, grades
 from factorgraph_dvl.sensors.dvl import LEVER_ARM, MISALIGNMENT, SCALE_ERROR
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION
+from factorgraph_dvl.sensors.usbl import MISALIGNMENT as USBL_MISALIGNMENT
+from factorgraph_dvl.sensors.usbl import SOUND_SPEED_ERROR as USBL_SOUND_SPEED_ERROR
 from factorgraph_dvl.solution import Calibration, Solution
 
 # Intrinsic orders: ZYX is yaw, then pitch, then roll; the angles are given as roll, pitch, yaw.
@@ -38,6 +40,25 @@ class Angles:
     value: Array
     std: Array
     grade: tuple[Grade, ...]
+
+
+@dataclass(frozen=True)
+class TransceiverTerms:
+    """How the transceiver of a USBL is mounted on its ship.
+
+    Parameters
+    ----------
+    attitude : Angles
+        Attitude of the transceiver in the ship, ZYX.
+    range_error : tuple of float or None
+        Share by which ranges are too long, and its standard deviation; None if not estimated.
+    range_grade : tuple of Grade
+        Grade of `range_error`.
+    """
+
+    attitude: Angles
+    range_error: tuple[float, float] | None
+    range_grade: tuple[Grade, ...]
 
 
 # What lever arms start from: the first of these records that a trial has, else the antenna.
@@ -167,16 +188,7 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     named = axes_as(recorded, "FRD", calibration.body_axes)
 
     def angles(of: Callable[[Array], Array]) -> Angles:
-        """Return angles that depend on the rotation vector, and their standard deviations."""
-        value = of(alpha)
-        steps = np.eye(3) * _STEP
-        J = np.stack(
-            [wrapped((of(alpha + h) - of(alpha - h)) * DEG) / DEG for h in steps], axis=1
-        ) / (2.0 * _STEP)
-        std = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
-        # An angle is as observable as the component that adds most to its standard deviation.
-        most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
-        return Angles(value, std, grades(std, seen[most], limit))
+        return _angles(of, alpha, covariance, seen, limit)
 
     def frd_attitude(vector: Array) -> Array:
         return attitude_of(exp_so3(vector * DEG) @ frd.T, named)
@@ -221,14 +233,56 @@ def instrument_of(calibration: Calibration | Solution) -> InstrumentTerms:
     )
 
 
-def _parts(calibration: Calibration | Solution) -> dict[str, tuple[Array, Array]]:
-    """Return value and covariance of each parameter, those that a DVL needs among them."""
+def transceiver_of(calibration: Calibration | Solution) -> TransceiverTerms | None:
+    """Return how the transceiver of a USBL is mounted, None if it was not estimated."""
+    parts = _values(calibration)
+    if USBL_MISALIGNMENT not in parts:
+        return None
+    seen = next(e.observable for e in calibration.estimates if e.name == USBL_MISALIGNMENT)
+    frd = frd_from_body(calibration.body_axes)
+
+    def attitude(vector: Array) -> Array:
+        return euler(frd @ exp_so3(vector * DEG).T @ frd.T, "ZYX")
+
+    limit = calibration.limits.get(USBL_MISALIGNMENT, np.inf)
+    angles = _angles(attitude, *parts[USBL_MISALIGNMENT], seen, limit)
+    known = parts.get(USBL_SOUND_SPEED_ERROR)
+    if known is None:
+        return TransceiverTerms(angles, None, ())
+    value, covariance = known
+    error = (float(value[0]), float(np.sqrt(covariance[0, 0])))
+    return TransceiverTerms(angles, error, calibration.grades[USBL_SOUND_SPEED_ERROR])
+
+
+def _angles(
+    of: Callable[[Array], Array], alpha: Array, covariance: Array, seen: BoolArray, limit: float
+) -> Angles:
+    """Return angles that depend on a rotation vector, deg, and their standard deviations."""
+    value = of(alpha)
+    steps = np.eye(3) * _STEP
+    J = np.stack([wrapped((of(alpha + h) - of(alpha - h)) * DEG) / DEG for h in steps], axis=1) / (
+        2.0 * _STEP
+    )
+    std = np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
+    # An angle is as observable as the component that adds most to its standard deviation.
+    most = np.argmax(np.abs(J) * np.sqrt(np.diag(covariance)), axis=1)
+    return Angles(value, std, grades(std, seen[most], limit))
+
+
+def _values(calibration: Calibration | Solution) -> dict[str, tuple[Array, Array]]:
+    """Return value and covariance of each parameter."""
     parts: dict[str, tuple[Array, Array]] = {}
     at = 0
     for e in calibration.estimates:
         rows = slice(at, at + e.value.size)
         parts[e.name] = (e.value, calibration.covariance[rows, rows])
         at = rows.stop
+    return parts
+
+
+def _parts(calibration: Calibration | Solution) -> dict[str, tuple[Array, Array]]:
+    """Return value and covariance of each parameter, those that a DVL needs among them."""
+    parts = _values(calibration)
     for name in NEEDED:
         if name not in parts:
             beams = DIRECTION in parts

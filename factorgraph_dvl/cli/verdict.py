@@ -49,10 +49,19 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     page : Path
         Page of the result.
     """
-    from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
+    from factorgraph_dvl.analysis.instrument_terms import (
+        has_instrument_terms,
+        instrument_of,
+        transceiver_of,
+    )
     from factorgraph_dvl.analysis.mount import mount_in_words
     from factorgraph_dvl.quality.texts import text_of
-    from factorgraph_dvl.report.entries import MOUNT, entries_table, sum_with_compass
+    from factorgraph_dvl.report.entries import (
+        MOUNT,
+        entries_table,
+        sum_with_compass,
+        usbl_table,
+    )
 
     print_verdict(solution.verdict)
     is_usable = solution.verdict.grade != "do not use" and has_instrument_terms(solution)
@@ -67,6 +76,8 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         table = entries_table(terms, maker)
         words = " ".join(map(text_of, mount_in_words(terms.axes)))
         print_entries(replace(table, caption=f"{MOUNT} {words} {table.caption}"))
+        if (transceiver := transceiver_of(solution)) is not None:
+            print_entries(usbl_table(transceiver))
     if not events.active():
         stdout().print(f"Open {page}", markup=False, soft_wrap=True)
 

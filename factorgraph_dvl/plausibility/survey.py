@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factorgraph_dvl.errors import DataError, FactorgraphDvlError
+from factorgraph_dvl.plausibility.beacons import beacon_findings
 from factorgraph_dvl.plausibility.clocks import time_findings
 from factorgraph_dvl.plausibility.consistency import consistency_findings
 from factorgraph_dvl.plausibility.dvl import BEAM_TERMS, DVL_TERMS, beam_findings, dvl_findings
@@ -19,6 +20,7 @@ from factorgraph_dvl.plausibility.records import SensorSurvey, record_of, travel
 from factorgraph_dvl.plausibility.star import star_findings
 from factorgraph_dvl.plausibility.usbl import usbl_findings
 from factorgraph_dvl.quality.finding import Code, Finding, errors_of
+from factorgraph_dvl.sensors.beacon import Beacons
 from factorgraph_dvl.sensors.beam_geometry import as_dvl
 from factorgraph_dvl.sensors.speed_log import SpeedLog
 from factorgraph_dvl.sensors.star import Star
@@ -73,6 +75,8 @@ def _of_single_sensors(trial: Trial, sensors: list[SensorSurvey]) -> Iterator[Fi
             yield from star_findings(aid, trial)
         if isinstance(aid, Usbl):
             yield from usbl_findings(trial, aid)
+        if isinstance(aid, Beacons):
+            yield from beacon_findings(trial, aid)
 
 
 @dataclass(frozen=True)

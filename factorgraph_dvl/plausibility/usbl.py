@@ -22,18 +22,19 @@ from factorgraph_dvl.trial import Trial
 _FEWEST = 20
 # Share of the size of a track from which on another one is not the same, and how much better than
 # as it is recorded one must fit to be it. Chosen: dead reckoning drifts by a tenth.
-_SAME, _BETTER = 0.3, 3.0
+_SAME, BETTER = 0.3, 3.0
 # Chosen: fixes in a row, and usual distances from the track, that make a run elsewhere.
 _IN_A_ROW, _FAR = 5, 10.0
 # Rounds in which far fixes lose weight. Chosen: more change nothing.
 _ROUNDS = 10
-# Part of an angle up to which another is the same. Chosen: one mount in a hundred is by chance.
+# Part of an angle up to which another is the same. Chosen: of mounts that are known to 2 deg, four
+# in a hundred look by chance as a convergence of 1 deg makes them look.
 _SAME_ANGLE = 0.1
 _MISALIGNMENT = "usbl_misalignment_deg"
 # Range, m, beyond which no system hears a reply.
 _FARTHEST = 1.2e4
 # What a range is multiplied by where it was recorded as a time, one way or both, by 1500 m/s.
-_TIMES = (
+TIMES = (
     (message("usbl_track.range_s"), 1500.0),
     (message("usbl_track.range_two_way_s"), 750.0),
     (message("usbl_track.range_ms"), 1.5),
@@ -51,7 +52,7 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
         return
     size, distance, time = as_recorded
     misfit = median(distance)
-    best, cause = misfit / _BETTER, None
+    best, cause = misfit / BETTER, None
     for text, changed in _candidates(usbl):
         found = _misfit(trial, changed, *reckoned)
         if found is not None and median(found[1]) < best:
@@ -62,8 +63,11 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
     elif misfit > _SAME * size:
         text = message("usbl_track.other_vehicle", misfit=misfit, size=size)
         yield Finding(Code.USBL_TRACK, text, usbl.label)
+    elif elsewhere := list(_elsewhere(usbl, distance, time)):
+        yield from elsewhere
     else:
-        yield from _elsewhere(usbl, distance, time)
+        text = message("usbl_track.follows", misfit=misfit)
+        yield Finding(Code.USBL_TRACK, text, usbl.label, severity="ok")
 
 
 def grid_north_findings(trial: Trial, estimates: Sequence[Estimate]) -> Iterator[Finding]:
@@ -113,7 +117,7 @@ def _candidates(usbl: Usbl) -> Iterator[tuple[Message, Usbl]]:
     north = replace(ship, rph=ship.rph * [1.0, 1.0, 0.0])
     yield message("usbl_track.from_north"), replace(usbl, ship=north)
     farthest = float(np.nanmax(np.linalg.norm(raw, axis=1)))
-    for text, factor in _TIMES:
+    for text, factor in TIMES:
         if factor * farthest < _FARTHEST:
             yield text, seen(raw * factor)
 

@@ -113,6 +113,7 @@ class Code(StrEnum):
     LOG_SIGN = "log_sign"
     DEPTH_SIGN = "depth_sign"
     BEACON_HEIGHT = "beacon_height"
+    BEACON_RANGES = "beacon_ranges", "error"
     USBL_TRACK = "usbl_track", "error"
     USBL_RUN = "usbl_run"
     USBL_GRID_NORTH = "usbl_grid_north"

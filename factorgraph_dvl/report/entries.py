@@ -12,6 +12,7 @@ from factorgraph_dvl.analysis.instrument_terms import (
     TRDI_AXES,
     WATER_LINKED_AXES,
     InstrumentTerms,
+    TransceiverTerms,
 )
 from factorgraph_dvl.analysis.mount import looks_down
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -23,6 +24,7 @@ from factorgraph_dvl.sensors.dvl import MISALIGNMENT
 
 TITLE = "Enter in your DVL"
 MOUNT = "Mount, by the axes of the record:"
+USBL_TITLE = "Enter in your USBL"
 # Why a value must not be entered, by its grade.
 REFUSED = {
     "red": "σ is more than twice its limit",
@@ -36,6 +38,7 @@ _MAKERS = {
     "Delph": ("exail", "ixblue", "ixsea", "delph"),
 }
 _AT_ZERO = "The maker's numbers are valid if its settings were 0 in the trial."
+_NOT_THESE = "Do not enter red or grey values."
 _ONCE = "Enter the angles once: in the DVL or in the navigation software, not in both."
 _REMARKS = {
     "TRDI": (_AT_ZERO, _ONCE),
@@ -71,6 +74,10 @@ _MAKERS_NUMBERS = (
     "are here too if trial.yaml has certificate: {dvl: {maker: …}}."
 )
 _NO_ROWS = "The maker's own numbers are not given: with them, the DVL would not look down."
+USBL_DEFINITIONS = (
+    "Attitude of the transceiver in the ship, ZYX: heading first, then pitch, then roll.",
+    "It comes on top of what was set in the USBL, whose own signs may be others.",
+)
 _MAKER_AXES = {"TRDI": TRDI_AXES, "Nortek": NORTEK_AXES, "Water Linked": WATER_LINKED_AXES}
 
 
@@ -132,6 +139,46 @@ def entries_of(i: InstrumentTerms) -> tuple[Entry, ...]:
     )
 
 
+def usbl_entries(t: TransceiverTerms) -> tuple[Entry, ...]:
+    """Return roll, pitch, heading of a transceiver and the error of its ranges."""
+    words = (
+        ("roll_deg", "roll", "deg", "starboard down"),
+        ("pitch_deg", "pitch", "deg", "bow up"),
+        ("heading_deg", "heading", "deg", "to starboard"),
+    )
+    angles = t.attitude
+    out = [
+        Entry(*own, float(value), float(std), grade)
+        for own, value, std, grade in zip(
+            words, angles.value, angles.std, angles.grade, strict=True
+        )
+    ]
+    if t.range_error is not None:
+        value, std = (100.0 * x for x in t.range_error)
+        own = ("range_error_percent", "range error", "%", "reads too much")
+        out.append(Entry(*own, value, std, t.range_grade[0]))
+    return tuple(out)
+
+
+def usbl_table(t: TransceiverTerms) -> Table:
+    """Return the table of what to enter in a USBL, for the terminal and for the page."""
+    table = _empty(USBL_TITLE, " ".join((*USBL_DEFINITIONS, _NOT_THESE)))
+    for e in usbl_entries(t):
+        table.row(e.name, with_std(e.value, e.std), e.unit, e.rule, Mark(e.grade, GRADES[e.grade]))
+    return table
+
+
+def _empty(title: str, caption: str) -> Table:
+    """Return a table of entries without rows."""
+    table = Table(title=title, caption=caption)
+    table.column("quantity")
+    table.column("value ± σ", numeric=True)
+    table.column("unit")
+    table.column("positive")
+    table.column("grade")
+    return table
+
+
 def entries_table(i: InstrumentTerms, maker: str | None = None) -> Table:
     """Return the table of what to enter, for the terminal and for the page.
 
@@ -143,12 +190,7 @@ def entries_table(i: InstrumentTerms, maker: str | None = None) -> Table:
         Maker of the DVL, empty if a trial does not state it; where it is known, the table has the
         maker's own names too. By default the numbers are not those of one trial.
     """
-    table = Table(title=TITLE, caption=" ".join(conventions(i, maker)))
-    table.column("quantity")
-    table.column("value ± σ", numeric=True)
-    table.column("unit")
-    table.column("positive")
-    table.column("grade")
+    table = _empty(TITLE, " ".join(conventions(i, maker)))
     for e in (entries := entries_of(i)):
         table.row(
             e.name, with_std(e.value, e.std), e.unit, e.rule, Mark(e.grade, GRADES[e.grade]),
@@ -180,7 +222,7 @@ def conventions(i: InstrumentTerms, maker: str | None = None) -> tuple[str, ...]
     maker : str, optional
         Maker of the DVL, as for `entries_table`.
     """
-    common = (*definitions(i), "Do not enter red or grey values.")
+    common = (*definitions(i), _NOT_THESE)
     if maker is None:
         return common
     known = _maker(maker)

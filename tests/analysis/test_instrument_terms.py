@@ -10,7 +10,7 @@ import yaml
 from builders import build_solution
 from scipy.spatial.transform import Rotation
 
-from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of
+from factorgraph_dvl.analysis.instrument_terms import ORDERS, instrument_of, transceiver_of
 from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.rotations import exp_so3, frd_from_body
@@ -57,6 +57,31 @@ def test_angles_give_the_misalignment_back(alpha, body_axes):
         np.testing.assert_allclose(
             rotation_of(found.dvl_in_body[order].value, order, body_axes), dRb.T, atol=1e-12
         )
+
+
+@pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])
+def test_what_to_enter_in_a_usbl_is_the_attitude_of_its_transceiver(body_axes):
+    """Bow up by 2 deg, then roll: in the text with the angles by which it is mounted."""
+    roll, pitch, heading = 1.0, 2.0, -3.0
+    attitude = rotation_of(np.array([roll, pitch, heading]), "ZYX", body_axes)
+    alpha = Rotation.from_matrix(attitude.T).as_rotvec(degrees=True)
+    dvl = calibrated([0.0, 0.0, 0.0], body_axes)
+    names = ("usbl_misalignment_deg", "usbl_sound_speed_error")
+    added = tuple(
+        replace(e, name=name, value=value)
+        for name, e, value in zip(names, dvl.estimates, (alpha, np.array([-0.002])), strict=False)
+    )
+    std = np.concatenate([e.std for e in (*dvl.estimates, *added)])
+    both = replace(dvl, estimates=(*dvl.estimates, *added), covariance=np.diag(np.square(std)))
+    assert transceiver_of(dvl) is None
+    terms = transceiver_of(both)
+    np.testing.assert_allclose(terms.attitude.value, [roll, pitch, heading], atol=1e-9)
+    assert 0.019 < terms.attitude.std.min() < terms.attitude.std.max() < 0.041
+    entered = yaml.safe_load(instrument_text(both))["enter_in_usbl"]
+    assert entered == {
+        "roll_deg": 1.0, "pitch_deg": 2.0, "heading_deg": -3.0, "range_error_percent": -0.2,
+    }  # fmt: skip
+    assert "enter_in_usbl" not in yaml.safe_load(instrument_text(dvl))
 
 
 @pytest.mark.parametrize("body_axes", ["RFU", "FRD", "FLU"])

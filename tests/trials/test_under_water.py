@@ -75,6 +75,25 @@ def test_transponders_are_found_between_fixes_at_the_surface(without_imu):
         assert np.all(solution.estimate(name).std[:2] < 1.0)
 
 
+def test_without_fixes_only_the_shape_of_a_net_is_known_and_said():
+    beacons = {"rate_hz": 1, "positions": PLACES, "range_std_m": 0.3}
+    made = simulate(trial(False, gnss=None, beacons=beacons), seed=1)
+    solution = solve(made, rate_hz=1.0)
+    names = [f"beacon_{name}_offset_m" for name in PLACES]
+    check(solution, made.calibration_truth, [*names, "misalignment_deg", "lever_arm_m"])
+    order = solution.calibration.order
+    rows = [order.index(n) for name in names for n in solution.estimate(name).component_names]
+    P = solution.calibration.covariance[np.ix_(rows, rows)]
+    # Its middle is known as before, 20 m of each of three; how it is spread, by the ranges.
+    middle = np.tile(np.eye(3), (1, 3)) / 3.0
+    assert np.all(np.sqrt(np.diag(middle @ P @ middle.T)[:2]) > 0.95 * 20.0 / np.sqrt(3.0))
+    apart = np.hstack([np.eye(3), -np.eye(3), np.zeros((3, 3))])
+    assert np.sqrt(np.linalg.eigvalsh((apart @ P @ apart.T)[:2, :2])[0]) < 2.0
+    said = [str(f) for f in solution.findings if f.parameter in names]
+    assert len(said) == 3
+    assert all("the trial has no GNSS" in text for text in said)
+
+
 def test_a_heading_of_the_ship_in_grid_north_is_named():
     usbl = {"rate_hz": 1, "measures": "polar", "range_std_m": 0.1, "angle_std_deg": 0.1}
     ship = SHIP | {"misalignment_deg": [0.02, -0.01, 0.03]}

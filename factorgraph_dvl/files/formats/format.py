@@ -53,6 +53,7 @@ Kind = Literal[
     "clock",
     "transponder",
     "acoustic",
+    "transceiver",
     "topside",
     "settings",
 ]
@@ -117,7 +118,11 @@ FIXES: tuple[Kind, ...] = ("fix", "transponder")
 # transponder
 #           the same of a transponder under water.
 # acoustic  `place` of the vehicle, forward, starboard, down of a vessel at the surface; `std`; m.
-# topside   `lat`, `lon` of that vessel and `quality` as in GGA; its true `heading`.
+# transceiver
+#           what the transceiver of a USBL measured in its own axes: `polar`, range m, bearing
+#           clockwise from forward and depression, or `place` forward, starboard, down, m.
+# topside   `lat`, `lon`, `height`, `altitude` of that vessel, `quality` as in GGA; roll, pitch and
+#           true heading.
 # settings  what was set for the file that `Batch.stream` names, without a time: magnetic
 #           `declination`; `transducer_depth` m; `heading_offset` of an external compass; `delay`
 #           of GNSS, s.
@@ -145,8 +150,13 @@ KINDS: dict[Kind, np.dtype[Any]] = {
     "depth": np.dtype([*_HEAD, ("depth", "f8")]),
     "clock": np.dtype([*_HEAD, ("number", "i8")]),
     "acoustic": np.dtype([*_HEAD, ("place", "f8", (3,)), ("std", "f8")]),
+    "transceiver": np.dtype([*_HEAD, ("polar", "f8", (3,)), ("place", "f8", (3,))]),
     "topside": np.dtype(
-        [*_HEAD, *((name, "f8") for name in ("lat", "lon", "quality", "heading"))]
+        [
+            *_HEAD,
+            *((name, "f8") for name in ("lat", "lon", "height", "altitude", "quality")),
+            *_RPH,
+        ]
     ),
     "settings": np.dtype(
         [
@@ -286,6 +296,9 @@ def faults(batch: Batch) -> dict[str, NDArray[np.bool_]]:
         valueless = ~(np.isfinite(records["gyro"]) & np.isfinite(records["accel"])).all(axis=1)
     elif batch.kind == "acoustic":
         valueless = ~np.isfinite(records["place"]).all(axis=1)
+    elif batch.kind == "transceiver":
+        polar, place = records["polar"], records["place"]
+        valueless = ~(np.isfinite(polar).all(axis=1) | np.isfinite(place).all(axis=1))
     elif batch.kind == "topside":
         valueless = ~has_place(records) & np.isnan(records["heading"])
     elif batch.kind == "attitude":

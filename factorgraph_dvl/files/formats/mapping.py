@@ -83,11 +83,17 @@ FIELDS: dict[Kind, dict[str, tuple[str, int | None, str]]] = {
         **{name: ("place", i, "m") for i, name in enumerate(_FRD)},
         "std": ("std", None, "m"),
     },
+    "transceiver": {
+        "range": ("polar", 0, "m"),
+        "bearing": ("polar", 1, "deg"),
+        "depression": ("polar", 2, "deg"),
+        **{name: ("place", i, "m") for i, name in enumerate(_FRD)},
+    },
     "topside": {
-        "lat": ("lat", None, "deg"),
-        "lon": ("lon", None, "deg"),
+        **_PLACE,
+        "altitude": ("altitude", None, "m"),
         "quality": ("quality", None, "1"),
-        "heading": ("heading", None, "deg"),
+        **{name: (name, None, "deg") for name in _RPH},
     },
 }
 _NEEDED: dict[Kind, tuple[tuple[str, ...], ...]] = {
@@ -101,6 +107,7 @@ _NEEDED: dict[Kind, tuple[tuple[str, ...], ...]] = {
     "depth": (("depth",),),
     "transponder": (("lat", "lon"),),
     "acoustic": (_FRD,),
+    "transceiver": (("range", "bearing", "depression"), _FRD),
     "topside": (("lat", "lon"), ("heading",)),
 }
 
@@ -115,6 +122,7 @@ TableKind = Literal[
     "depth",
     "transponder",
     "acoustic",
+    "transceiver",
     "topside",
 ]
 ColumnName = str | int
@@ -229,10 +237,22 @@ class TableMapping(Section, frozen=True, kw_only=True):
 
 
 class MappingSettings(Section, frozen=True, kw_only=True):
-    """The whole of a mapping YAML: tables, and what to take over to trial.yaml."""
+    """The whole of a mapping YAML: tables, and what to take over to trial.yaml.
 
-    tables: tuple[TableMapping, ...]
+    `sentences` says whose the positions in files are, by patterns of names: `transponder` of the
+    vehicle under water, `topside` of its ship, `fix` of its own antenna.
+    """
+
+    tables: tuple[TableMapping, ...] = ()
+    sentences: dict[str, Literal["transponder", "topside", "fix"]] = msgspec.field(
+        default_factory=dict
+    )
     trial: dict[str, Any] = msgspec.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not (self.tables or self.sentences):
+            raise ValueError("there must be `tables` or `sentences`")
 
     def of(self, path: Path, *, topics: bool = False) -> tuple[TableMapping, ...]:
         """Return the tables that a file contains, or the topics that a bag does."""

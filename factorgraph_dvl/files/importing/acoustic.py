@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
 import numpy as np
 
-from factorgraph_dvl.files.formats.format import KINDS, empty
+from factorgraph_dvl.files.formats.format import KINDS, Kind, empty
 from factorgraph_dvl.files.formats.framing import Records
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import Beside, Merged, merge
@@ -29,7 +30,12 @@ _LONGEST_STEP = 5.0
 _SMOOTH = 0.3
 
 
-def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> list[Timed]:
+def located(
+    streams: Sequence[Timed],
+    spool: Spool,
+    decisions: Decisions,
+    whose: Mapping[str, Kind] | None = None,
+) -> list[Timed]:
     """Replace places relative to a vessel by fixes.
 
     p = p_vessel + Rz(heading) place. The variance of a fix is that of the place, plus that of the
@@ -43,24 +49,30 @@ def located(streams: Sequence[Timed], spool: Spool, decisions: Decisions) -> lis
         Takes the fixes.
     decisions : Decisions
         Takes what was done.
+    whose : mapping of str to Kind, optional
+        Whose the positions in files are, by patterns of their names.
 
     Returns
     -------
     list of Timed
-        Without the kinds `acoustic` and `topside`, whose motion is not that of the vehicle.
+        Without the kind `acoustic`; with `topside`, whose motion is not that of the vehicle, only
+        beside a transceiver.
     """
-    streams = _of_one_transponder(_with_vessel(streams, decisions), decisions)
-    others = [t for t in streams if t.stream.kind not in ("acoustic", "topside")]
-    vessel = [t for t in streams if t.stream.kind == "topside"]
+    streams = _with_vessel(streams, decisions, whose or {})
+    streams = _of_one_transponder(streams, decisions)
+    raw = any(t.stream.kind == "transceiver" for t in streams)
+    left_out = ("acoustic",) if raw else ("acoustic", "topside")
+    others = [t for t in streams if t.stream.kind not in left_out]
+    vessel = [timed for timed in streams if timed.stream.kind == "topside"]
     places = merge([t for t in streams if t.stream.kind == "acoustic"], decisions)
     if places is None:
-        for timed in vessel:
+        for timed in () if raw else vessel:
             decisions.add(
                 timed.stream.label, "of a vessel, and no file has places relative to it → not used"
             )
         return others
-    position = _fullest(vessel, "lat", decisions)
-    heading = _fullest(vessel, "heading", decisions)
+    position = of_vessel(streams, ("lat",), decisions)
+    heading = of_vessel(streams, ("heading",), decisions)
     used = [t for part in (position, heading) if part is not None for t in part.streams]
     for timed in vessel:
         if timed not in used:
@@ -125,23 +137,31 @@ def _judge(label: str, changes: Array, stated: Array, decisions: Decisions) -> N
     decisions.add(label, text, "usbl.position_std_m")
 
 
-def _with_vessel(streams: Sequence[Timed], decisions: Decisions) -> list[Timed]:
-    """Return streams with fixes and headings beside places of a USBL as those of the vessel."""
-    if not any(
-        t.stream.format in _BESIDE_SENTENCES and t.stream.kind == "acoustic" for t in streams
-    ):
-        return list(streams)
+def _with_vessel(
+    streams: Sequence[Timed], decisions: Decisions, whose: Mapping[str, Kind]
+) -> list[Timed]:
+    """Return streams with fixes and headings as those of whom they are.
+
+    Beside places of a USBL, those in sentences are the vessel's, if nothing else is stated.
+    """
+    beside = any(
+        t.stream.format in _BESIDE_SENTENCES and t.stream.kind in ("acoustic", "transceiver")
+        for t in streams
+    )
     out = []
     for timed in streams:
         stream = timed.stream
-        of_vessel = stream.format == _SENTENCES and stream.kind in ("fix", "attitude")
-        if of_vessel:
-            decisions.add(
-                stream.label, "beside places of a USBL → position or heading of the ship"
-            )
+        kind = next((k for name, k in whose.items() if fnmatchcase(stream.file, name)), None)
+        text = "as the mapping states"
+        if kind is None and beside and stream.format == _SENTENCES:
+            kind, text = "topside", "beside places of a USBL"
+        if kind == "topside" and stream.kind in ("fix", "attitude"):
+            decisions.add(stream.label, f"{text} → position or heading of the ship")
             records = stream.records.converted(_as_topside)
-            stream = replace(stream, kind="topside", records=records)
-            timed = replace(timed, stream=stream)
+            timed = replace(timed, stream=replace(stream, kind=kind, records=records))
+        elif kind == "transponder" and stream.kind == "fix":
+            decisions.add(stream.label, f"{text} → positions of the vehicle under water")
+            timed = replace(timed, stream=replace(stream, kind=kind))
         out.append(timed)
     return out
 
@@ -170,9 +190,16 @@ def _of_one_transponder(streams: Sequence[Timed], decisions: Decisions) -> list[
     return [t for t in streams if t not in under or t.stream.stream == best]
 
 
-def _fullest(streams: Sequence[Timed], name: str, decisions: Decisions) -> Merged | None:
-    """Return the records of the vessel with the most values of a field, None without."""
-    known = [t for t in streams if np.isfinite(t.stream.records[:1000][name]).any()]
+def of_vessel(
+    streams: Sequence[Timed], names: Sequence[str], decisions: Decisions
+) -> Merged | None:
+    """Return the most records of the vessel that have some fields, None without."""
+    known = [
+        t
+        for t in streams
+        if t.stream.kind == "topside"
+        and all(np.isfinite(t.stream.records[:1000][name]).any() for name in names)
+    ]
     if not known:
         return None
     return merge([max(known, key=lambda t: t.known)], decisions)
@@ -185,10 +212,10 @@ def _fixes(places: Merged, position: Beside, heading: Beside) -> Iterator[tuple[
             out[name] = part[name]
         out["time"] = time
         vessel_time, vessel = position.around(time)
-        lat, lon = (_between(time, vessel_time, vessel[name]) for name in ("lat", "lon"))
+        lat, lon = (between(time, vessel_time, vessel[name]) for name in ("lat", "lon"))
         heading_time, headings = heading.around(time)
         known = np.isfinite(headings["heading"])
-        psi = _between(time, heading_time[known], np.unwrap(headings["heading"][known]))
+        psi = between(time, heading_time[known], np.unwrap(headings["heading"][known]))
         forward, starboard, down = part["place"].T
         north = forward * np.cos(psi) - starboard * np.sin(psi)
         east = forward * np.sin(psi) + starboard * np.cos(psi)
@@ -204,7 +231,7 @@ def _fixes(places: Merged, position: Beside, heading: Beside) -> Iterator[tuple[
         yield time, out
 
 
-def _between(time: Array, known: Array, values: Array) -> Array:
+def between(time: Array, known: Array, values: Array) -> Array:
     """Return values at times, linear between records that are not far apart, else nan."""
     use = np.isfinite(values)
     known, values = known[use], values[use]

@@ -12,7 +12,13 @@ import numpy as np
 
 from factorgraph_dvl.files.formats.format import empty, has_place
 from factorgraph_dvl.files.formats.framing import Records
-from factorgraph_dvl.files.importing import motion, orientation, positions, velocity
+from factorgraph_dvl.files.importing import (
+    motion,
+    orientation,
+    positions,
+    transceiver,
+    velocity,
+)
 from factorgraph_dvl.files.importing.decisions import Decisions
 from factorgraph_dvl.files.importing.merging import Merged
 from factorgraph_dvl.files.importing.time_base import FIRST_DATE, Timed
@@ -20,6 +26,8 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.settings.yaml_file import dump_yaml
 from factorgraph_dvl.trial import NO_LOCK, NO_MOTION, NO_POSITION, NO_VELOCITY
 
+# Kinds of records, besides fixes, that say where a trial is.
+_PLACED = ("ins", "topside")
 # Why records of a kind are not used.
 _UNUSED = {
     "attitude": "attitude: an IMU or a navigation solution says how the vehicle turns",
@@ -100,6 +108,7 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     gnss = positions.choose(streams, decisions)
     if imu is not None and gnss is None:
         gnss = positions.choose(fixes_of_navigation(streams, decisions), decisions)
+    raw = transceiver.choose(streams, decisions)
     where = _place(gnss, streams)
     attitude = None
     if imu is None and ins is None:
@@ -116,10 +125,14 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
             f"{imu.count} samples → grade chosen; state that of your IMU",
             "imu.grade",
         )
-    if gnss is not None:
-        under_water = gnss.fixes.streams[0].stream.kind == "transponder"
-        add = _add_usbl if under_water else _add_gnss
-        add(out, gnss, imu is not None or ins is not None)
+    has_body = imu is not None or ins is not None
+    under_water = gnss is not None and gnss.fixes.streams[0].stream.kind == "transponder"
+    if gnss is not None and not under_water:
+        _add_gnss(out, gnss, has_body)
+    if raw is not None:
+        _add_usbl(out, raw.tables, has_body, raw.ship_tables)
+    elif gnss is not None and under_water:
+        _add_usbl(out, gnss.tables, has_body)
     deviations = None if ins is None else motion.choose(streams, "ins_std", decisions)
     if ins is not None:
         _add_ins(out, ins, deviations)
@@ -138,10 +151,11 @@ def assemble(streams: Sequence[Timed], name: str, decisions: Decisions) -> tuple
     chosen = [imu, ins] if attitude is None else [attitude.attitude]
     chosen += [] if gnss is None else [gnss.fixes, gnss.courses]
     chosen += [deviations, depth] if log is None else [deviations, depth, log.pings]
+    chosen += [] if raw is None else [raw.measured, raw.position, raw.attitude]
     used = [part for part in chosen if part is not None]
     _say_unused(streams, used, decisions)
     _say_apart(used, decisions)
-    if gnss is None and ins is None:
+    if gnss is None and ins is None and raw is None:
         decisions.lack(NO_POSITION)
     if log is None:
         decisions.lack(NO_VELOCITY)
@@ -183,7 +197,7 @@ def _place(
 ) -> tuple[float, float] | None:
     """Return a latitude and longitude of the trial, rad."""
     parts = [] if gnss is None else [gnss.fixes.sample]
-    parts += [timed.stream.records[:1000] for timed in streams if timed.stream.kind == "ins"]
+    parts += [timed.stream.records[:1000] for timed in streams if timed.stream.kind in _PLACED]
     for part in parts:
         known = part[has_place(part)]
         if len(known):
@@ -211,8 +225,8 @@ def _say_unused(streams: Sequence[Timed], used: Sequence[Merged], decisions: Dec
             decisions.add(label, f"{_UNUSED[kind]} → not used")
 
 
-def _add_usbl(out: Assembly, fixes: positions.Positions, has_body: bool) -> None:
-    """Add positions of a transponder under water."""
+def _add_usbl(out: Assembly, tables: Tables, has_body: bool, ship: Tables | None = None) -> None:
+    """Add positions of a transponder under water, or what the transceiver of a ship measured."""
     keys: dict[str, Any] = {"transponder_lever_arm_m": [0.0, 0.0, 0.0]}
     out.decisions.add(
         "usbl.transponder_lever_arm_m",
@@ -224,7 +238,16 @@ def _add_usbl(out: Assembly, fixes: positions.Positions, has_body: bool) -> None
         out.decisions.add(
             "usbl.time_offset_std_s", "no IMU → the clock of the positions is that of the trial"
         )
-    out.add("usbl", fixes.tables, **keys)
+    if ship is not None:
+        keys["ship"] = {"file": "ship" + SUFFIX, "transceiver_lever_arm_m": [0.0, 0.0, 0.0]}
+        out.tables["ship"] = ship
+        out.decisions.add(
+            "usbl.ship",
+            "no file states where the transceiver is on the ship → at the point whose position "
+            "is recorded; measure it, and state it",
+            "usbl.ship",
+        )
+    out.add("usbl", tables, **keys)
 
 
 def _add_gnss(out: Assembly, gnss: positions.Positions, has_body: bool) -> None:

@@ -33,7 +33,7 @@ from factorgraph_dvl.files.importing.spool import Spool
 from factorgraph_dvl.files.importing.time_base import on_utc
 
 NEW_SETTINGS = "trial.yaml.new"
-_SECTIONS = ("imu", "ins", "gnss", "usbl", "attitude", "dvl", "dvl_beams", "depth")
+_SECTIONS = ("imu", "ins", "gnss", "usbl", "ship", "attitude", "dvl", "dvl_beams", "depth")
 # The log first: a folder without it was not written by an import.
 OWNED = (LOG_FILE, SETTINGS_FILE, NEW_SETTINGS, *(name + SUFFIX for name in _SECTIONS))
 _SPOOL = ".spool"
@@ -102,7 +102,9 @@ def import_files(
             for error in useless:
                 decisions.warn(f"{error.where}: {error.what}")
             _mention_settings([Path(path) for path in files], formats, decisions)
-            streams = located(on_utc(spool.streams(), spool, decisions), spool, decisions)
+            whose = {} if mapping is None else mapping.sentences
+            streams = on_utc(spool.streams(), spool, decisions)
+            streams = located(streams, spool, decisions, whose)
             say("assemble")
             name = as_text(paths[0].stem)
             assembly, epoch = assemble(streams, name, decisions)
@@ -208,6 +210,6 @@ def _override(settings: dict[str, Any], stated: Mapping[str, Any]) -> None:
     """Take over what a mapping states of trial.yaml."""
     for section, content in stated.items():
         if isinstance(content, Mapping) and isinstance(settings.get(section), dict):
-            settings[section] |= content
+            _override(settings[section], content)
         else:
             settings[section] = content

@@ -15,6 +15,7 @@ from factorgraph_dvl.analysis.instrument_terms import (
     InstrumentTerms,
     Order,
     instrument_of,
+    transceiver_of,
 )
 from factorgraph_dvl.analysis.mount import looks_down, mount_in_words
 from factorgraph_dvl.errors import printable
@@ -26,10 +27,14 @@ from factorgraph_dvl.report.entries import (
     RECORDED_AXES,
     REFUSED,
     TITLE,
+    USBL_DEFINITIONS,
+    USBL_TITLE,
+    Entry,
     definitions,
     entries_of,
     hundredths,
     sum_with_compass,
+    usbl_entries,
     worst,
 )
 from factorgraph_dvl.solution import Calibration, Solution
@@ -75,20 +80,30 @@ def instrument_text(calibration: Calibration | Solution) -> str:
         "# The DVL reads (1 + scale error) times the velocity.",
         *(f"# {said}" for said in definitions(i)[1:]),
         "enter_in_dvl:",
-        *(
-            _line(
-                f"  {e.key}: {e.text}",
-                e.grade,
-                f"± {at_precision(e.std, e.std)}; positive: {e.rule}",
-            )
-            for e in entries_of(i)
-        ),
+        *map(_entry, entries_of(i)),
         "",
         "# The mount, with the axes of the DVL as they were recorded:",
         *(f"# {text_of(sentence)}" for sentence in mount_in_words(i.axes)),
+        *_of_usbl(calibration),
         *_further(i),
     ]
     return verdict_text(calibration.verdict) + "\n".join(lines) + "\n"
+
+
+def _of_usbl(calibration: Calibration | Solution) -> Iterator[str]:
+    """Yield what to enter in a USBL, if its mounting was estimated."""
+    terms = transceiver_of(calibration)
+    if terms is None:
+        return
+    yield from ("", f"# {USBL_TITLE}.", *(f"# {said}" for said in USBL_DEFINITIONS))
+    yield "enter_in_usbl:"
+    yield from map(_entry, usbl_entries(terms))
+
+
+def _entry(e: Entry) -> str:
+    """Return the line of a number to enter."""
+    about = f"± {at_precision(e.std, e.std)}; positive: {e.rule}"
+    return _line(f"  {e.key}: {e.text}", e.grade, about)
 
 
 def _line(text: str, grade: Grade, about: str = "") -> str:

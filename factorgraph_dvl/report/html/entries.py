@@ -4,15 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from factorgraph_dvl.analysis.instrument_terms import InstrumentTerms, instrument_of
+from factorgraph_dvl.analysis.instrument_terms import (
+    InstrumentTerms,
+    instrument_of,
+    transceiver_of,
+)
 from factorgraph_dvl.analysis.mount import mount_in_words
 from factorgraph_dvl.quality.texts import text_of
 from factorgraph_dvl.report.entries import (
     MOUNT,
     TITLE,
+    USBL_DEFINITIONS,
+    USBL_TITLE,
     conventions,
     entries_table,
     sum_with_compass,
+    usbl_table,
 )
 from factorgraph_dvl.report.html.content import Result
 from factorgraph_dvl.report.html.markup import Html, both, described, element, joined, paragraph
@@ -37,6 +44,10 @@ def entries_content(result: Result) -> Iterator[Html]:
         element("div", drawing),
         class_="entries",
     )
+    if (transceiver := transceiver_of(result.solution)) is not None:
+        yield element("h3", both(USBL_TITLE))
+        yield described(usbl_table(transceiver), label=USBL_TITLE)
+        yield paragraph(joined(*map(both, USBL_DEFINITIONS)))
 
 
 def values_to_enter(terms: InstrumentTerms, maker: str | None = None) -> Html:

@@ -11,7 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_pdf import PdfPages
 
-from factorgraph_dvl.analysis.instrument_terms import has_instrument_terms, instrument_of
+from factorgraph_dvl.analysis.instrument_terms import (
+    has_instrument_terms,
+    instrument_of,
+    transceiver_of,
+)
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import FRD_NAMES
 from factorgraph_dvl.geometry.vectors import Array
@@ -19,7 +23,15 @@ from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.texts import Language, component_names
 from factorgraph_dvl.report.certificate import statements
 from factorgraph_dvl.report.check import check_rows, check_texts
-from factorgraph_dvl.report.entries import TITLE, conventions, entries_table, sum_with_compass
+from factorgraph_dvl.report.entries import (
+    TITLE,
+    USBL_DEFINITIONS,
+    USBL_TITLE,
+    conventions,
+    entries_table,
+    sum_with_compass,
+    usbl_table,
+)
 from factorgraph_dvl.report.figures.drawing import VERDICT_COLOURS, envelope, log_axis, style
 from factorgraph_dvl.report.figures.vessel import draw_vessel
 from factorgraph_dvl.report.html.content import Result
@@ -91,6 +103,10 @@ def _first_page(sheet: Sheet, result: Result) -> None:
             sheet.text(f"{sheet.said('Mount and compass:')} {_said(found, sheet.language)}", SMALL)
         _table(sheet, entries_table(terms, result.maker))
         sheet.text(" ".join(map(sheet.said, conventions(terms, result.maker))), SMALL)
+        if (transceiver := transceiver_of(solution)) is not None:
+            sheet.heading(USBL_TITLE)
+            _table(sheet, usbl_table(transceiver))
+            sheet.text(" ".join(map(sheet.said, USBL_DEFINITIONS)), SMALL)
         places = places_of(terms, solution, result.run.get("settings", {}))
         sheet.space(0.25)
         drawings = sheet.axes(min(3.0, sheet.left - 0.9), 2, labels=0.55)
