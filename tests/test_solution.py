@@ -155,7 +155,7 @@ def test_a_scale_error_that_no_log_has_is_not_to_be_used(solution, value, std, s
     (np.sin(np.deg2rad(20)) / np.sin(np.deg2rad(30)) - 1, "look 20 deg from the vertical, and 30"),
     (np.sin(np.deg2rad(25)) / np.sin(np.deg2rad(30)) - 1, "look 25 deg from the vertical, and 30"),
     (-2.02, "the sign is reversed"),
-    (-1.2, "a current, a wrong unit or another error"),
+    (-1.2, "a current, a bed that moves, a false bottom lock, a wrong unit or another error"),
 ])  # fmt: skip
 def test_a_scale_error_names_its_cause(solution, value, cause):
     scale = replace(

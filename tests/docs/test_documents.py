@@ -309,6 +309,8 @@ def test_blocks_that_are_not_run_say_why():
         "docs/getting-started.md": ["recordings"],
         "docs/getting-started.zh.md": ["recordings"],
         "docs/import.md": ["recordings", "needs"],
+        "docs/underwater.md": ["needs"],
+        "docs/underwater.zh.md": ["needs"],
         "docs/verdict.md": ["part"],
         "examples/compass-plugin/README.md": ["installs"],
     }
