@@ -261,13 +261,14 @@ def run_blocks(name: str, stock: Path, folder: Path, run: Run, *, slow: bool) ->
             pytest.fail(f"{where}: no language, so nothing says how to run it")
 
 
-# Their commands are run by the blocks of other pages too, and take long.
+# They take long, and the commands of most are run by the blocks of other pages too.
 LONG = (
     "README.md",
     "docs/crosscheck.md",
     "docs/getting-started.md",
     "docs/kalman.md",
     "docs/replay.md",
+    "docs/underwater.md",
 )
 
 
