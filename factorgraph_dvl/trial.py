@@ -33,7 +33,7 @@ from factorgraph_dvl.sensors.protocol import Aid, NoiseModel, SensorRecord
 from factorgraph_dvl.sensors.records import joined, rows_of
 from factorgraph_dvl.sensors.speed_log import Heading, SpeedLog
 from factorgraph_dvl.sensors.turntable import Turntable
-from factorgraph_dvl.sensors.usbl import Usbl
+from factorgraph_dvl.sensors.usbl import Usbl, near_their_neighbours
 
 _Sensor = TypeVar("_Sensor", bound=Aid)
 _Record = TypeVar("_Record", bound=Aid | Imu)
@@ -383,8 +383,14 @@ class Trial:
         return self.fixes or self.find(Ins)
 
     def with_fixes(self) -> Trial:
-        """Return the trial with the positions of a USBL as if GNSS had measured them."""
-        return self if self.fixes is self.gnss else replace(self, gnss=self.fixes)
+        """Return the trial with the positions of a USBL as if GNSS had measured them.
+
+        Those far from their neighbours are left out: a start is made from differences of them.
+        """
+        if self.fixes is None or self.fixes is self.gnss:
+            return self
+        near = near_their_neighbours(self.fixes, self.frame())
+        return replace(self, gnss=rows_of(self.fixes, near))
 
     @property
     def body_sensor(self) -> Imu | Attitude | Ins | Heading:

@@ -9,6 +9,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 from msgspec import UNSET, UnsetType
+from scipy.ndimage import median_filter
 
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
@@ -56,6 +57,9 @@ _POLAR_SI = np.array([1.0, DEG, DEG])
 # Least standard deviation of a direction, m: straight down, a bearing moves nothing.
 _LEAST_STD = 1e-3
 
+# Fixes of which a median is taken, and standard deviations from it that are far. Chosen: a start
+# loses nothing by a few good ones that are left out.
+_NEIGHBOURS, _STRAY = 9, 5.0
 _CLOCK = Clock.of("usbl", prefix="usbl_")
 TIME_OFFSET = _CLOCK.offset.name
 _MISALIGNMENT = ParameterSpec("usbl_misalignment", "deg", kind="rotation", frame="b")
@@ -507,3 +511,22 @@ class FromShip(ObservationByRows):
 def _length(vectors: Array) -> Array:
     """Return the lengths of vectors (M, 3), (M, 1)."""
     return np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def near_their_neighbours(fixes: Gnss, frame: LocalFrame) -> BoolArray:
+    """Return which fixes (M,) are near the median of those around them.
+
+    A single one that is wrong is in no median of nine, and the vehicle goes on little meanwhile.
+
+    Parameters
+    ----------
+    fixes : Gnss
+        Positions in the order of time.
+    frame : LocalFrame
+        Navigation frame.
+    """
+    p_n = frame.position(*fixes.geodetic.T)
+    middle = median_filter(p_n, size=(_NEIGHBOURS, 1), mode="nearest")
+    off = np.linalg.norm(p_n - middle, axis=1)
+    noise = np.hypot(np.linalg.norm(fixes.position_std, axis=1), np.median(off))
+    return np.asarray(off < _STRAY * noise)

@@ -15,8 +15,9 @@ from factorgraph_dvl.files.trial_folder import load_trial, record_files, save_tr
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
+from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.ship import Ship, ShipSettings
-from factorgraph_dvl.sensors.usbl import Usbl, UsblSettings
+from factorgraph_dvl.sensors.usbl import Usbl, UsblSettings, near_their_neighbours
 from factorgraph_dvl.settings.convert import convert
 from factorgraph_dvl.simulation import plan_motion, simulate
 
@@ -202,3 +203,24 @@ def test_settings_are_checked():
 def test_it_passes_the_check_of_sensors(measures):
     trial = simulate(scenario(usbl=usbl(measures=measures)))
     fd.check_sensor(trial.find(Usbl), trial.frame(), trial.body_axes)
+
+
+def test_fixes_that_are_far_from_their_neighbours_begin_nothing():
+    frame = LocalFrame(0.6, 2.1, 0.0)
+    rng = np.random.default_rng(3)
+    time = np.arange(0.0, 600.0, 2.0)
+    # A box at 1.5 m/s, with corners.
+    side = 1.5 * (time % 150.0)
+    corner = 225.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    ahead = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    leg = (time // 150.0).astype(int)
+    p_n = np.column_stack([corner[leg] + side[:, None] * ahead[leg], np.full(time.size, -50.0)])
+    p_n += rng.normal(0.0, 0.3, p_n.shape)
+    wrong = rng.random(time.size) < 0.1
+    p_n[wrong, :2] += rng.choice([-1.0, 1.0], (wrong.sum(), 2)) * rng.uniform(10.0, 40.0)
+    none = np.full((time.size, 3), np.nan)
+    geodetic = np.stack(frame.geodetic(p_n), axis=1)
+    fixes = Gnss(GnssSettings(), time, geodetic, none, np.full((time.size, 3), 0.3), none)
+    near = near_their_neighbours(fixes, frame)
+    assert not near[wrong].any()
+    assert near[~wrong].mean() > 0.97
