@@ -223,4 +223,5 @@ def test_fixes_that_are_far_from_their_neighbours_begin_nothing():
     fixes = Gnss(GnssSettings(), time, geodetic, none, np.full((time.size, 3), 0.3), none)
     near = near_their_neighbours(fixes, frame)
     assert not near[wrong].any()
-    assert near[~wrong].mean() > 0.97
+    # Some are lost at both ends, where a median is of one side.
+    assert near[~wrong].mean() > 0.95
