@@ -122,8 +122,9 @@ def one(job):
 @pytest.fixture(scope="module", params=TIMES)
 def runs(request):
     # Two runs of the first minutes show too little of a band; those of tactical grade are quick.
-    half = request.param in RATE and "tactical" not in request.param
-    count = RUNS // 2 if half else RUNS
+    first_minutes, quick = request.param in RATE, "tactical" in request.param
+    count = RUNS // 2 if first_minutes and not quick else RUNS
+    count = max(count, 3) if first_minutes and quick else count
     count = 2 if request.param.endswith(WHOLE) else count
     return in_two_processes(one, [(request.param, seed) for seed in range(count)])
 
