@@ -387,10 +387,10 @@ class Trial:
 
         Those far from their neighbours are left out: a start is made from differences of them.
         """
-        if self.fixes is None or self.fixes is self.gnss:
+        fixes = self.fixes
+        if fixes is None or fixes is self.gnss:
             return self
-        near = near_their_neighbours(self.fixes, self.frame())
-        return replace(self, gnss=rows_of(self.fixes, near))
+        return replace(self, gnss=rows_of(fixes, near_their_neighbours(fixes, self.frame())))
 
     @property
     def body_sensor(self) -> Imu | Attitude | Ins | Heading:

@@ -427,9 +427,8 @@ class DvlVelocity(ObservationByRows):
         dvl_b, imu_b = _velocity_at_dvl(motion, values)
         bRn = motion.nRb.transpose(0, 2, 1)
         scale, axes, flexed_b = 1.0 + values[SCALE_ERROR], values[MISALIGNMENT], dvl_b
-        distorted = is_distorted(values)
+        distorted, found = is_distorted(values), self._distortion(motion, values, dvl_b)
         if distorted:
-            found = self._distortion(motion, values, dvl_b)
             scale, axes, flexed_b = 1.0 + found.scale, found.axes @ axes, found.turned()
         unscaled_d = flexed_b @ axes.T
         seen_d, passed = scale * unscaled_d, np.ones_like(unscaled_d)
@@ -444,7 +443,7 @@ class DvlVelocity(ObservationByRows):
         derivatives: dict[str, Callable[[], Array]] = {}
         more = None
         if distorted or not set(NAMES).isdisjoint(wanted):
-            more = self._distortion(motion, values, dvl_b).derivatives(unscaled_d, dMb, passed)
+            more = found.derivatives(unscaled_d, dMb, passed)
             derivatives |= more.parameters
             by_velocity = more.velocity
         d_v = by_velocity @ bRn
