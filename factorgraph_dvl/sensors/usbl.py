@@ -525,8 +525,12 @@ def near_their_neighbours(fixes: Gnss, frame: LocalFrame) -> BoolArray:
     frame : LocalFrame
         Navigation frame.
     """
-    p_n = frame.position(*fixes.geodetic.T)
+    known = np.isfinite(fixes.geodetic[:, 0])
+    p_n = frame.position(*fixes.geodetic[known].T)
     middle = median_filter(p_n, size=(_NEIGHBOURS, 1), mode="nearest")
     off = np.linalg.norm(p_n - middle, axis=1)
-    noise = np.hypot(np.linalg.norm(fixes.position_std, axis=1), np.median(off))
-    return np.asarray(off < _STRAY * noise)
+    noise = np.hypot(np.linalg.norm(fixes.position_std[known], axis=1), np.median(off))
+    # Velocities without a position stay.
+    out = ~known
+    out[known] = off < _STRAY * noise
+    return out

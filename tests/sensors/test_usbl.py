@@ -225,3 +225,10 @@ def test_fixes_that_are_far_from_their_neighbours_begin_nothing():
     assert not near[wrong].any()
     # Some are lost at both ends, where a median is of one side.
     assert near[~wrong].mean() > 0.95
+    # What has no position spoils no median.
+    without = np.insert(geodetic, 150, np.nan, axis=0)
+    times, std = np.insert(time, 150, time[149] + 1.0), np.full((time.size + 1, 3), 0.3)
+    absent = np.full((time.size + 1, 3), np.nan)
+    again = near_their_neighbours(Gnss(GnssSettings(), times, without, absent, std, absent), frame)
+    assert again[150]
+    np.testing.assert_array_equal(np.delete(again, 150), near)
