@@ -12,12 +12,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
+import json
 import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Executor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, as_completed
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -28,12 +29,19 @@ import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.campaign.cluster import connected
+from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
 ROOT = Path(__file__).resolve().parents[1]
 # Not tracked: a page of the documentation is only written where `--out` says so.
 OUT = ROOT / "out" / "benchmarks"
+SEVEN = (
+    *(f"misalignment_{axis}_deg" for axis in "xyz"),
+    "scale_error",
+    *(f"lever_arm_{axis}_m" for axis in "xyz"),
+)
 # A sample of each page, which a test holds against the code: all of this seed.
 SAMPLED_SEED = 0
 
@@ -121,6 +129,40 @@ def pool(jobs: int) -> Iterator[Executor]:
         yield client.get_executor(pure=False)
 
 
+def kept_runs(
+    args: Any, name: str, wanted: Iterable[tuple[Any, ...]], run: Callable[..., dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Return what a function says of each run, with those that were kept for the same commit.
+
+    Parameters
+    ----------
+    args : Namespace
+        Folder and number of processes.
+    name : str
+        Name of the file in the folder, JSON by line, which a run joins when it is done.
+    wanted : iterable of tuple
+        Arguments of each run.
+    run : callable
+        What becomes of them.
+    """
+    path = args.out / name
+    own, kept = commit(), {}
+    for line in path.read_text("utf-8").splitlines() if path.exists() else ():
+        saved = json.loads(line)
+        if saved["commit"] == own:
+            kept[tuple(saved["of"])] = saved["is"]
+    wanted = list(wanted)
+    with pool(args.jobs) as executor, path.open("a", encoding="utf-8") as file:
+        running = {executor.submit(run, *each): each for each in wanted if each not in kept}
+        for number, future in enumerate(as_completed(running), start=1):
+            each = running[future]
+            kept[each] = future.result()
+            file.write(json.dumps({"commit": own, "of": each, "is": kept[each]}) + "\n")
+            file.flush()
+            print(f"{number} of {len(running)}:", *each, flush=True)
+    return [kept[each] for each in wanted]
+
+
 def new_figure(width: float, height: float) -> Figure:
     """Return an empty figure, inches."""
     figure = Figure(figsize=(width, height), dpi=110)
@@ -138,6 +180,17 @@ def save_figure(figure: Figure, path: Path) -> None:
 def rms(values: Any) -> float:
     """Return the root mean square."""
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def nees(solution: Solution, truth: Mapping[str, Any]) -> float:
+    """Return NEES/7 of misalignment, scale and lever arm; NaN where one is not estimated."""
+    error = calibration_errors(solution, truth)
+    own = [error.names.index(name) for name in SEVEN if name in error.names]
+    if len(own) < len(SEVEN):
+        return np.nan
+    at = [solution.order.index(name) for name in SEVEN]
+    e = error.error[own]
+    return float(e @ np.linalg.solve(solution.covariance[np.ix_(at, at)], e)) / len(SEVEN)
 
 
 def until(trial: Trial, end: float) -> Trial:

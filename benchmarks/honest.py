@@ -8,17 +8,15 @@ are done are kept in `honest.jsonl` beside it, for the same commit.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from collections import Counter
-from concurrent.futures import as_completed
 from typing import Any
 
 import common
 import numpy as np
 
-from factorgraph_dvl.analysis.error_statistics import calibration_errors, nees_band
+from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
 
@@ -30,11 +28,6 @@ SCENARIOS = (
     "luo-2024-turning", "luo-2024-accelerating", "luo-2024-steady", "beams-turntable",
     "cruise", "cruise-mems", "ship", "ship-water",
 )  # fmt: skip
-SEVEN = (
-    *(f"misalignment_{axis}_deg" for axis in "xyz"),
-    "scale_error",
-    *(f"lever_arm_{axis}_m" for axis in "xyz"),
-)
 INTRODUCTION = """\
 # Honest trials
 
@@ -58,14 +51,6 @@ def outcome(scenario: str, seed: int) -> dict[str, Any]:
     start = time.process_time()
     solution = solve(trial, rate_hz=1.0)
     cpu = time.process_time() - start
-    errors = calibration_errors(solution, trial.calibration_truth)
-    own = [errors.names.index(name) for name in SEVEN if name in errors.names]
-    nees = np.nan
-    if len(own) == len(SEVEN):
-        at = [solution.order.index(name) for name in SEVEN]
-        P = solution.covariance[np.ix_(at, at)]
-        error = errors.error[own]
-        nees = float(error @ np.linalg.solve(P, error)) / len(SEVEN)
     objective = [step.objective for step in solution.steps]
     return {
         "scenario": scenario,
@@ -76,7 +61,7 @@ def outcome(scenario: str, seed: int) -> dict[str, Any]:
         "reasons": [
             f"{r.code} {r.sensor} {r.parameter}".strip() for r in solution.verdict.reasons
         ],
-        "nees": nees,
+        "nees": common.nees(solution, trial.calibration_truth),
         "steps": [step.change for step in solution.steps[1:]],
         "iterations": solution.iterations,
         "rises": int(np.sum(np.diff(objective) > 0.0)),
@@ -120,27 +105,13 @@ def main() -> None:
     parser = common.parser(__doc__, seeds=15)
     parser.add_argument("--only", default="", help="regular expression of scenarios")
     args = common.parse(parser)
-    kept = args.out / "honest.jsonl"
-    runs = []
-    if kept.exists():
-        lines = [json.loads(line) for line in kept.read_text("utf-8").splitlines()]
-        runs = [line for line in lines if line.pop("commit") == common.commit()]
-    done = {(r["scenario"], r["seed"]) for r in runs}
     wanted = [
         (name, seed)
         for seed in range(args.seeds)
         for name in SCENARIOS
-        if re.search(args.only, name) and (name, seed) not in done
+        if re.search(args.only, name)
     ]
-    with common.pool(args.jobs) as executor, kept.open("a", encoding="utf-8") as file:
-        for future in as_completed([executor.submit(outcome, *each) for each in wanted]):
-            runs.append(future.result())
-            file.write(json.dumps(runs[-1] | {"commit": common.commit()}) + "\n")
-            file.flush()
-            print(
-                f"{len(runs)}: {runs[-1]['scenario']} {runs[-1]['seed']} {runs[-1]['grade']}",
-                flush=True,
-            )
+    runs = common.kept_runs(args, "honest.jsonl", wanted, outcome)
     runs.sort(key=lambda r: (SCENARIOS.index(r["scenario"]), r["seed"]))
     print(common.write_page(args.out / PAGE, page(args.origin, runs)))
 

@@ -2,15 +2,15 @@
 
     python benchmarks/ships.py [--hours H ...] [--seeds N] [--jobs N] [--out DIR]
 
-writes `ships.md` into out/benchmarks. The trials are the first hours of `configs/ship-water.yaml`:
-no IMU, and a current of 0.3 m/s with a correlation time of an hour. Of trials below two hours
-there are three times as many, and those with an INS are twice as many, of 24 minutes.
+writes `ships.md` into out/benchmarks. Ships through water are the first hours of
+`configs/ship-water.yaml`: no IMU, and a current of 0.3 m/s with a correlation time of an hour.
+Those over ground are `configs/ship.yaml` with an INS. Runs that are done are kept in `ships.jsonl`
+beside it, for the same commit.
 """
 
 from __future__ import annotations
 
 import resource
-from dataclasses import dataclass
 from time import process_time
 from typing import Any
 
@@ -18,6 +18,7 @@ import common
 import numpy as np
 
 from factorgraph_dvl import kalman, solve
+from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.sensors.attitude import SCHULER_PERIOD
 from factorgraph_dvl.simulation import parse_scenario, simulate
@@ -33,7 +34,7 @@ COMPARED = (("misalignment_deg", 2), ("scale_error", 0))
 PERIOD = 720.0
 # Means of so many seconds of the dense reference.
 SPAN = 60.0
-SHORT_HOURS, MORE_SHORT, MORE_INS = 2.0, 3, 2
+LENGTHS = (0.4, 1.0, 4.0)
 # An INS whose velocity errs by 0.05 m/s with the period of Schuler.
 INS = {
     "rate_hz": 1,
@@ -44,75 +45,70 @@ INS = {
 }
 
 
-@dataclass(frozen=True)
-class Run:
-    """One trial, solved.
-
-    Parameters
-    ----------
-    seconds, memory : float
-        Processor time, s, and most memory, MB.
-    deviations : ndarray, shape (7,)
-        Errors of the calibration in standard deviations.
-    current : ndarray, shape (2,) or (0,)
-        The same of the mean current.
-    errors : ndarray, shape (2, 2)
-        Errors of phase, deg, and scale, then those of Joyce.
-    excess : ndarray, shape (2,)
-        Standard deviations of phase and scale over those of least squares.
-    usable : bool
-        Whether the solver does not say that its result is not to be used.
-    """
-
-    seconds: float
-    memory: float
-    deviations: np.ndarray
-    current: np.ndarray
-    errors: np.ndarray
-    excess: np.ndarray
-    usable: bool
-
-
 def main() -> None:
     parser = common.parser(__doc__, seeds=20)
-    parser.add_argument("--hours", type=float, action="append", help="of a trial (1 and 4)")
+    parser.add_argument("--hours", type=float, action="append", help="of a trial (0.4, 1 and 4)")
     args = common.parse(parser)
     lines = [
         "# Ships without an IMU: measured\n",
         f"{args.origin} [Ships without a raw IMU](no-imu.md) says what is assumed.\n",
         f"- machine at the start: {common.machine()}",
-        "- Root mean squares over all trials but those that the solver says are not to be used. "
-        "σ is the reported standard deviation.",
+        "- Through water: compass, GNSS, and an ADCP that sees moving water. Over ground: a DVL, "
+        "and an INS whose velocity errs by 0.05 m/s with the period of Schuler.",
+        "- Errors over σ are root mean squares, σ the reported standard deviation. NEES/7 is that "
+        "of misalignment, scale and lever arm, with the band of 99 % of right ones. Trials that "
+        "the solver says are not to be used are left out.",
         "- The reference is generalised least squares of means of a minute, with the covariances "
         "that the simulation draws from.",
         "- Joyce is `kalman --method joyce` on the same trials.\n",
-        "| hours | trials | not to be used | errors over σ | of the mean current "
-        "| errors of phase, scale | over those of Joyce | σ over that of the reference "
-        "| processor time, s | memory, MB |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| ship | hours | trials | not to be used | errors over σ | NEES/7 (band) "
+        "| mean current over σ | errors of phase, scale | over those of Joyce "
+        "| σ over that of the reference | processor time, s | memory, MB |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    everything: list[Run] = []
-    with common.pool(args.jobs) as pool:
-        for hours in args.hours or (1.0, 4.0):
-            count = args.seeds * (MORE_SHORT if hours < SHORT_HOURS else 1)
-            runs = list(pool.map(through_water, [hours] * count, range(count)))
-            kept = [r for r in runs if r.usable]
-            everything += kept
-            lines.append(row(hours, len(runs), kept))
-            print(lines[-1], flush=True)
-        beside = list(pool.map(beside_ins, range(MORE_INS * args.seeds)))
-    beside = [r for r in beside if r.usable]
-    pooled = common.rms([r.deviations for r in everything])
-    lines.append(f"\nErrors over σ, all {len(everything)} trials through water: {pooled:.2f}.\n")
-    lines.append("Errors over σ by component:\n")
-    lines.append(by_component("through water", everything))
-    ins = common.rms([r.deviations for r in beside])
-    lines.append(by_component("INS with a Schuler error", beside))
-    lines.append(
-        f"\nErrors over σ, {len(beside)} trials of 24 minutes over ground with an INS "
-        f"whose velocity errs by 0.05 m/s with the period of Schuler: {ins:.2f}."
-    )
-    common.write_page(args.out / PAGE, lines)
+    lengths = args.hours or LENGTHS
+    # Short ones first: a row is whole as early as it can be.
+    wanted = [
+        (kind, hours, seed) for hours in lengths for kind in KINDS for seed in range(args.seeds)
+    ]
+    found = common.kept_runs(args, "ships.jsonl", wanted, outcome)
+    each = dict(zip(wanted, found, strict=True))
+    for kind in KINDS:
+        for hours in lengths:
+            own = [each[kind, hours, seed] for seed in range(args.seeds)]
+            lines.append(row(kind, hours, own))
+    lines.append("\nErrors over σ by component:\n")
+    for kind in KINDS:
+        own = [each[of] for of in wanted if of[0] == kind and each[of]["usable"]]
+        lines.append(by_component(kind, own))
+    print(common.write_page(args.out / PAGE, lines))
+
+
+def outcome(kind: str, hours: float, seed: int) -> dict[str, Any]:
+    """Solve one trial; return what became of it."""
+    scenario = KINDS[kind](hours)
+    trial = simulate(scenario, seed)
+    start = process_time()
+    found = solve(trial, rate_hz=1.0)
+    seconds = process_time() - start
+    truth = trial.calibration_truth
+    out = {
+        "seconds": seconds,
+        "memory": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "usable": found.verdict.grade != "do not use",
+        "deviations": deviations(found, truth, CALIBRATED).tolist(),
+        "nees": common.nees(found, truth),
+    }
+    if kind == WATER:
+        joyce = kalman(trial, method="joyce")
+        std = [found.estimate(n).std[i] for n, i in COMPARED]
+        dense = dense_standard_deviations(trial, scenario, SPAN) / np.array([DEG, 1.0])
+        out |= {
+            "current": deviations(found, truth, ("current_m_s",)).tolist(),
+            "errors": [errors(solution, truth) for solution in (found, joyce)],
+            "excess": (np.array(std) / dense).tolist(),
+        }
+    return out
 
 
 def ship_through_water(hours: float) -> Scenario:
@@ -122,48 +118,13 @@ def ship_through_water(hours: float) -> Scenario:
     return parse_scenario(data)
 
 
-def through_water(hours: float, seed: int) -> Run:
-    """Solve one trial through water by both methods."""
-    scenario = ship_through_water(hours)
-    trial = simulate(scenario, seed)
-    found, seconds = solved(trial)
-    truth = trial.calibration_truth
-    both = np.array([errors(s, truth) for s in (found, kalman(trial, method="joyce"))])
-    std = [found.estimate(n).std[i] for n, i in COMPARED]
-    dense = dense_standard_deviations(trial, scenario, SPAN) / np.array([DEG, 1.0])
-    return Run(
-        seconds=seconds,
-        memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
-        deviations=deviations(found, truth, CALIBRATED),
-        current=deviations(found, truth, ("current_m_s",)),
-        errors=both,
-        excess=np.array(std) / dense,
-        usable=is_usable(found),
-    )
-
-
-def beside_ins(seed: int) -> Run:
-    """Solve one trial over ground with an INS in place of compass and GNSS."""
+def ship_beside_ins(hours: float) -> Scenario:
+    """Return the first hours of the scenario over ground, an INS in place of compass and GNSS."""
     data: dict[str, Any] = common.config("ship", ins=INS)
-    data["manoeuvres"][0]["repeat"] = 2
+    data["manoeuvres"][0]["repeat"] = round(hours * 3600.0 / PERIOD)
     data["trial"] = {"dvl": data["trial"]["dvl"]}
     del data["attitude"], data["gnss"]
-    trial = simulate(parse_scenario(data), seed)
-    found, seconds = solved(trial)
-    own = deviations(found, trial.calibration_truth, CALIBRATED)
-    return Run(seconds, 0.0, own, np.zeros(0), np.zeros((2, 2)), np.zeros(2), is_usable(found))
-
-
-def solved(trial: Trial) -> tuple[Solution, float]:
-    """Return the solution, and the processor time that it took, s."""
-    start = process_time()
-    found = solve(trial, rate_hz=1.0)
-    return found, process_time() - start
-
-
-def is_usable(found: Solution) -> bool:
-    """Whether the solver does not say that its result is not to be used."""
-    return found.verdict.grade != "do not use"
+    return parse_scenario(data)
 
 
 def deviations(
@@ -179,29 +140,38 @@ def errors(solution: Solution, truth: dict[str, np.ndarray]) -> list[float]:
     return [float(solution.estimate(n).value[i] - truth[n][i]) for n, i in COMPARED]
 
 
-def row(hours: float, count: int, runs: list[Run]) -> str:
+def row(kind: str, hours: float, runs: list[dict[str, Any]]) -> str:
     """Return the row of trials that are equally long, by those that are usable."""
-    ours, theirs = np.sqrt(np.mean(np.square([r.errors for r in runs]), axis=0))
-    share, excess = ours / theirs, np.mean([r.excess for r in runs], axis=0)
-    seconds = [r.seconds for r in runs]
+    used = [r for r in runs if r["usable"]]
+    seconds = [r["seconds"] for r in used]
+    low, high = (bound / 7 for bound in nees_band(7, len(used), 0.99))
+    compared = ["–"] * 4
+    if kind == WATER:
+        ours, theirs = np.sqrt(np.mean(np.square([r["errors"] for r in used]), axis=0))
+        share, excess = ours / theirs, np.mean([r["excess"] for r in used], axis=0)
+        compared = [
+            f"{common.rms([r['current'] for r in used]):.2f}",
+            f"{ours[0]:.3f}°, {ours[1]:.4f}",
+            f"{share[0]:.2f}, {share[1]:.2f}",
+            f"{excess[0]:.2f}, {excess[1]:.2f}",
+        ]
     cells = [
+        kind,
         f"{hours:g}",
-        f"{count}",
-        f"{count - len(runs)}",
-        f"{common.rms([r.deviations for r in runs]):.2f}",
-        f"{common.rms([r.current for r in runs]):.2f}",
-        f"{ours[0]:.3f}°, {ours[1]:.4f}",
-        f"{share[0]:.2f}, {share[1]:.2f}",
-        f"{excess[0]:.2f}, {excess[1]:.2f}",
+        f"{len(runs)}",
+        f"{len(runs) - len(used)}",
+        f"{common.rms([r['deviations'] for r in used]):.2f}",
+        f"{np.mean([r['nees'] for r in used]):.2f} ({low:.2f}–{high:.2f})",
+        *compared,
         f"{min(seconds):.0f} to {max(seconds):.0f}",
-        f"{max(r.memory for r in runs):.0f}",
+        f"{max(r['memory'] for r in used):.0f}",
     ]
     return "| " + " | ".join(cells) + " |"
 
 
-def by_component(name: str, runs: list[Run]) -> str:
+def by_component(name: str, runs: list[dict[str, Any]]) -> str:
     """Return root mean squares of errors over their standard deviations, one by one."""
-    values = np.sqrt(np.mean(np.square([r.deviations for r in runs]), axis=0))
+    values = np.sqrt(np.mean(np.square([r["deviations"] for r in runs]), axis=0))
     labels = ("roll", "pitch", "yaw", "scale", "lever arm x", "y", "z")
     named = ", ".join(f"{label} {v:.2f}" for label, v in zip(labels, values, strict=True))
     return f"- {name}: {named}"
@@ -237,6 +207,10 @@ def dense_standard_deviations(trial: Trial, scenario: Scenario, span: float) -> 
     stated = trial.attitude.settings.schuler_std_deg * DEG
     information[[2, 3], [2, 3]] += stated**-2.0
     return np.sqrt(np.diag(np.linalg.inv(information))[:2])
+
+
+WATER = "through water"
+KINDS = {WATER: ship_through_water, "over ground": ship_beside_ins}
 
 
 if __name__ == "__main__":
