@@ -30,6 +30,7 @@ from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation, observed
+from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.motion_strengths import Strengths
@@ -126,6 +127,8 @@ class Preparation:
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
         Mountings of attitude sensors found by the gyros, by parameter name.
+    strays : dict of str to ndarray
+        Weights of measurements that `start_positions` are made without, 0 or 1, by label.
     stated_imu : ImuSettings
         Settings of the IMU as the trial states them.
     findings : tuple of Finding
@@ -140,6 +143,7 @@ class Preparation:
     estimated_noise: frozenset[str]
     start_positions: StartPositions
     mountings: dict[str, Array]
+    strays: dict[str, Array]
     stated_imu: ImuSettings
     findings: tuple[Finding, ...]
 
@@ -238,6 +242,7 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         ),
         start_positions=start_positions,
         mountings=start.mountings,
+        strays=_strays(trial, on_one_clock, frame),
         stated_imu=stated,
         findings=(
             *trial.notes,
@@ -247,6 +252,18 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
             *start_positions.findings,
         ),
     )
+
+
+def _strays(trial: Trial, start: Trial, frame: LocalFrame) -> dict[str, Array]:
+    """Return the weights of what a USBL measured, 0 where a start does without the fix."""
+    usbl = trial.find(Usbl)
+    if usbl is None or start.gnss is None:
+        return {}
+    kept = {
+        o.label: np.isin(o.time, start.gnss.time)[:, None].astype(float)
+        for o in usbl.observations(frame, trial.body_axes)
+    }
+    return {label: weights for label, weights in kept.items() if not weights.all()}
 
 
 @dataclass(frozen=True)
@@ -277,17 +294,19 @@ def mounted_start(
     """Return states, and values of the parameters that fit them.
 
     GNSS and IMU alone smooth the motion first, unless the DVL is calibrated: such a one does
-    no harm from the start.
+    no harm from the start. Fixes that the states were made without have no part in it: they would
+    lead to where no other fix is. Afterwards all count, for the search for gross errors.
     """
     iterations = 0
     values = prepared.mountings
-    gross: dict[str, Array] = {}
+    gross = prepared.strays
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
         observations, parameters = observed(aids, prepared.frame, prepared.trial.body_axes)
         # In sway, errors of the IMU's axes look like a late clock.
         parameters = (*parameters, *prepared.trial.inertial.error_parameters())
         problem = Problem(chain, observations, parameters, start=prepared.mountings)
+        problem.robust_weights = gross
         coarse = minimise(
             problem,
             problem.values(states, problem.prior_values() | prepared.mountings),
@@ -298,7 +317,8 @@ def mounted_start(
             proven=False,
             enough=_ROUGHLY_NOISE,
         )
-        evaluation, iterations = coarse.evaluation, coarse.iterations
+        gross = problem.robust_weights = {}
+        evaluation, iterations = problem.weighed(coarse.evaluation), coarse.iterations
         count = sum(np.count_nonzero(weights) for weights in problem.weights)
         if 2.0 * evaluation.cost > _GROSS * count:
             gross, evaluation = robust_weights(problem, evaluation) or (gross, evaluation)
