@@ -21,7 +21,8 @@ from factorgraph_dvl.trial import Trial
 # Fewest fixes that make a track. Chosen.
 _FEWEST = 20
 # Share of the size of a track from which on another one is not the same, and how much better than
-# as it is recorded one must fit to be it. Chosen: dead reckoning drifts by a tenth.
+# as it is recorded one must fit to be it. Noise may be as many times what is stated. Chosen: dead
+# reckoning drifts by a tenth.
 _SAME, BETTER = 0.3, 3.0
 # Chosen: fixes in a row, and usual distances from the track, that make a run elsewhere.
 _IN_A_ROW, _FAR = 5, 10.0
@@ -50,17 +51,17 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
     as_recorded = _misfit(trial, usbl, *reckoned)
     if as_recorded is None:
         return
-    size, distance, time = as_recorded
+    size, noise, distance, time = as_recorded
     misfit = median(distance)
     best, cause = misfit / BETTER, None
     for text, changed in _candidates(usbl):
         found = _misfit(trial, changed, *reckoned)
-        if found is not None and median(found[1]) < best:
-            best, cause = median(found[1]), text
+        if found is not None and median(found[2]) < best:
+            best, cause = median(found[2]), text
     if cause is not None:
         text = message("usbl_track.because", misfit=misfit, left=best, cause=cause)
         yield Finding(Code.USBL_TRACK, text, usbl.label)
-    elif misfit > _SAME * size:
+    elif misfit > max(_SAME * size, BETTER * noise):
         text = message("usbl_track.other_vehicle", misfit=misfit, size=size)
         yield Finding(Code.USBL_TRACK, text, usbl.label)
     elif elsewhere := list(_elsewhere(usbl, distance, time)):
@@ -124,8 +125,8 @@ def _candidates(usbl: Usbl) -> Iterator[tuple[Message, Usbl]]:
 
 def _misfit(
     trial: Trial, usbl: Usbl, time: Array, track: Array
-) -> tuple[float, Array, Array] | None:
-    """Return size of a track (m), distances of fixes from it (M,), and their times; None if few.
+) -> tuple[float, float, Array, Array] | None:
+    """Return size of a track (m), noise, distances (M,) and times of fixes from it; None if few.
 
     The track is turned and shifted to fit: its heading has an unknown constant.
     """
@@ -148,7 +149,9 @@ def _misfit(
         distance = np.abs(b - b_mean - turn * (a - a_mean))
         usual = max(median(distance), 1e-6)
         weight = usual / np.maximum(distance, usual)
-    return float(np.sqrt(np.mean(np.abs(a - a.mean()) ** 2))), distance, at
+    size = float(np.sqrt(np.mean(np.abs(a - a.mean()) ** 2)))
+    noise = median(np.linalg.norm(fixes.position_std[inside, :2], axis=1))
+    return size, noise, distance, at
 
 
 def _reckoned(trial: Trial) -> tuple[Array, Array] | None:

@@ -167,6 +167,7 @@ UNUSABLE = frozenset(
         Code.ZERO_FIXES,
         Code.RADIANS,
         Code.NO_EPOCH,
+        Code.USBL_TRACK,
     }
 )
 

@@ -9,6 +9,7 @@ import pytest
 from truth import config
 
 import factorgraph_dvl as fd
+from factorgraph_dvl.errors import DataError
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.usbl import Usbl
 
@@ -110,3 +111,22 @@ def test_the_record_of_another_vehicle_is_not_explained(trial):
 
     (finding,) = found(trial, other)
     assert "another transponder" in str(finding)
+
+
+def test_a_vehicle_that_stays_within_the_noise_is_no_other_one():
+    hover = [{"straight_s": 30}, {"turn_deg_s": 4.5, "duration_s": 20, "ramp_s": 4}] * 4
+    changes = {
+        "manoeuvres": hover,
+        "imu": {"rate_hz": 20},
+        "start": {"speed_m_s": 0.02},
+        "usbl": {"angle_std_deg": 2.0},
+    }
+    (finding,) = found(fd.simulate(config("dive-usbl", **changes), seed=3), lambda usbl: usbl)
+    assert finding.severity == "ok"
+
+
+def test_what_contradicts_the_track_is_refused_with_its_reason(trial):
+    mirrored = seen(lambda at: at * [1.0, -1.0, 1.0])
+    others = tuple(mirrored(a) if isinstance(a, Usbl) else a for a in trial.others)
+    with pytest.raises(DataError, match="the bearing is mirrored"):
+        fd.solve(replace(trial, others=others))
