@@ -36,10 +36,10 @@ _MISALIGNMENT = "usbl_misalignment_deg"
 _FARTHEST = 1.2e4
 # What a range is multiplied by where it was recorded as a time, one way or both, by 1500 m/s.
 TIMES = (
-    (message("usbl_track.range_s"), 1500.0),
-    (message("usbl_track.range_two_way_s"), 750.0),
-    (message("usbl_track.range_ms"), 1.5),
-    (message("usbl_track.range_two_way_ms"), 0.75),
+    (message("usbl_axes.range_s"), 1500.0),
+    (message("usbl_axes.range_two_way_s"), 750.0),
+    (message("usbl_axes.range_ms"), 1.5),
+    (message("usbl_axes.range_two_way_ms"), 0.75),
 )
 
 
@@ -59,8 +59,8 @@ def usbl_findings(trial: Trial, usbl: Usbl) -> Iterator[Finding]:
         if found is not None and median(found[2]) < best:
             best, cause = median(found[2]), text
     if cause is not None:
-        text = message("usbl_track.because", misfit=misfit, left=best, cause=cause)
-        yield Finding(Code.USBL_TRACK, text, usbl.label)
+        text = message("usbl_axes.because", misfit=misfit, left=best, cause=cause)
+        yield Finding(Code.USBL_AXES, text, usbl.label)
     elif misfit > max(_SAME * size, BETTER * noise):
         text = message("usbl_track.other_vehicle", misfit=misfit, size=size)
         yield Finding(Code.USBL_TRACK, text, usbl.label)
@@ -112,11 +112,11 @@ def _candidates(usbl: Usbl) -> Iterator[tuple[Message, Usbl]]:
     def seen(changed: Array) -> Usbl:
         return replace(usbl, polar=np.full_like(changed, np.nan), cartesian=changed)
 
-    yield message("usbl_track.mirrored"), seen(raw * [1.0, -1.0, 1.0])
-    yield message("usbl_track.astern"), seen(raw * [-1.0, -1.0, 1.0])
-    yield message("usbl_track.swapped"), seen(raw[:, [1, 0, 2]])
+    yield message("usbl_axes.mirrored"), seen(raw * [1.0, -1.0, 1.0])
+    yield message("usbl_axes.astern"), seen(raw * [-1.0, -1.0, 1.0])
+    yield message("usbl_axes.swapped"), seen(raw[:, [1, 0, 2]])
     north = replace(ship, rph=ship.rph * [1.0, 1.0, 0.0])
-    yield message("usbl_track.from_north"), replace(usbl, ship=north)
+    yield message("usbl_axes.from_north"), replace(usbl, ship=north)
     farthest = float(np.nanmax(np.linalg.norm(raw, axis=1)))
     for text, factor in TIMES:
         if factor * farthest < _FARTHEST:

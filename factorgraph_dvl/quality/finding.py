@@ -114,6 +114,7 @@ class Code(StrEnum):
     DEPTH_SIGN = "depth_sign"
     BEACON_HEIGHT = "beacon_height"
     BEACON_RANGES = "beacon_ranges", "error"
+    USBL_AXES = "usbl_axes", "error"
     USBL_TRACK = "usbl_track", "error"
     USBL_RUN = "usbl_run"
     USBL_GRID_NORTH = "usbl_grid_north"
@@ -167,7 +168,7 @@ UNUSABLE = frozenset(
         Code.ZERO_FIXES,
         Code.RADIANS,
         Code.NO_EPOCH,
-        Code.USBL_TRACK,
+        Code.USBL_AXES,
     }
 )
 

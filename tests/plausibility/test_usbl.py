@@ -34,7 +34,7 @@ def trial(request):
 
 def found(trial, change):
     others = tuple(change(a) if isinstance(a, Usbl) else a for a in trial.others)
-    codes = (Code.USBL_TRACK, Code.USBL_RUN)
+    codes = (Code.USBL_AXES, Code.USBL_TRACK, Code.USBL_RUN)
     return [f for f in fd.survey(replace(trial, others=others)).findings if f.code in codes]
 
 
@@ -84,7 +84,7 @@ def test_gross_errors_that_come_alone_are_left_to_the_solver(trial):
 )
 def test_a_mistake_is_named(trial, change, text):
     (finding,) = found(trial, change)
-    assert finding.code == Code.USBL_TRACK
+    assert finding.code == Code.USBL_AXES
     assert finding.severity == "error"
     assert text in str(finding)
 
@@ -125,7 +125,7 @@ def test_a_vehicle_that_stays_within_the_noise_is_no_other_one():
     assert finding.severity == "ok"
 
 
-def test_what_contradicts_the_track_is_refused_with_its_reason(trial):
+def test_a_mistake_is_refused_with_its_reason(trial):
     mirrored = seen(lambda at: at * [1.0, -1.0, 1.0])
     others = tuple(mirrored(a) if isinstance(a, Usbl) else a for a in trial.others)
     with pytest.raises(DataError, match="the bearing is mirrored"):

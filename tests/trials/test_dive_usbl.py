@@ -18,10 +18,12 @@ from truth import config
 
 from factorgraph_dvl import predict
 from factorgraph_dvl.analysis.error_statistics import nees_band
+from factorgraph_dvl.geometry.vectors import interpolate
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.preparation import mounted_start, prepare
 
 SEEDS = int(os.environ.get("FACTORGRAPH_DVL_SEEDS", "3"))
 DVL = ("misalignment_deg", "scale_error", "lever_arm_m")
@@ -67,16 +69,34 @@ def changed(trial, change):
     return replace(trial, others=tuple(others))
 
 
+def gross(usbl):
+    """Return the record with a tenth of its fixes wrong."""
+    rng = np.random.default_rng(2)
+    polar = usbl.polar.copy()
+    wrong = rng.random(len(polar)) < 0.1
+    polar[wrong, 0] += rng.uniform(5.0, 50.0, wrong.sum())
+    polar[wrong, 1] = (polar[wrong, 1] + rng.normal(0.0, 0.5, wrong.sum())) % (2.0 * np.pi)
+    return replace(usbl, polar=polar)
+
+
+# Of thirteen dives, that whose start the wrong fixes led elsewhere when all of them counted.
+def test_gross_fixes_lead_no_start_elsewhere():
+    trial = simulate(config("dive-usbl"), 12)
+    spoilt = changed(trial, gross)
+    prepared = prepare(spoilt, 1.0, lambda *_: None)
+    (states,) = prepared.start_positions.states
+    chain = prepared.chain(states)
+    start = mounted_start(prepared, chain, states, lambda *_: None)
+    at, place_n = trial.reference.time, trial.frame().position(*trial.reference.geodetic.T)
+    error = start.states.p_n - interpolate(chain.segments.node_time, at, place_n)
+    assert np.linalg.norm(error, axis=1).max() < 5.0
+    weights = start.robust_weights["USBL"][:, 0]
+    wrong = np.any(spoilt.find(Usbl).polar != trial.find(Usbl).polar, axis=1)
+    np.testing.assert_array_equal(weights == 0.0, wrong)
+
+
 @pytest.mark.slow
 def test_gross_fixes_hardly_change_the_calibration():
-    def gross(usbl):
-        rng = np.random.default_rng(2)
-        polar = usbl.polar.copy()
-        wrong = rng.random(len(polar)) < 0.1
-        polar[wrong, 0] += rng.uniform(5.0, 50.0, wrong.sum())
-        polar[wrong, 1] = (polar[wrong, 1] + rng.normal(0.0, 0.5, wrong.sum())) % (2.0 * np.pi)
-        return replace(usbl, polar=polar)
-
     errors = []
     for seed in range(SEEDS):
         trial = simulate(config("dive-usbl"), seed)
