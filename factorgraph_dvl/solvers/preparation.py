@@ -127,8 +127,6 @@ class Preparation:
         States to start from, one set for each position that the ranges allow.
     mountings : dict of str to ndarray
         Mountings of attitude sensors found by the gyros, by parameter name.
-    strays : dict of str to ndarray
-        Weights of measurements that `start_positions` are made without, 0 or 1, by label.
     stated_imu : ImuSettings
         Settings of the IMU as the trial states them.
     findings : tuple of Finding
@@ -143,7 +141,6 @@ class Preparation:
     estimated_noise: frozenset[str]
     start_positions: StartPositions
     mountings: dict[str, Array]
-    strays: dict[str, Array]
     stated_imu: ImuSettings
     findings: tuple[Finding, ...]
 
@@ -242,7 +239,6 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
         ),
         start_positions=start_positions,
         mountings=start.mountings,
-        strays=_strays(trial, on_one_clock, frame),
         stated_imu=stated,
         findings=(
             *trial.notes,
@@ -254,14 +250,14 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
     )
 
 
-def _strays(trial: Trial, start: Trial, frame: LocalFrame) -> dict[str, Array]:
-    """Return the weights of what a USBL measured, 0 where a start does without the fix."""
-    usbl = trial.find(Usbl)
-    if usbl is None or start.gnss is None:
+def strays(trial: Trial) -> dict[str, Array]:
+    """Return the weights of what a USBL measured, 0 where a start is made without the fix."""
+    usbl, start = trial.find(Usbl), trial.on_one_clock().with_fixes().gnss
+    if usbl is None or start is None:
         return {}
     kept = {
-        o.label: np.isin(o.time, start.gnss.time)[:, None].astype(float)
-        for o in usbl.observations(frame, trial.body_axes)
+        o.label: np.isin(o.time, start.time)[:, None].astype(float)
+        for o in usbl.observations(trial.frame(), trial.body_axes)
     }
     return {label: weights for label, weights in kept.items() if not weights.all()}
 
@@ -299,7 +295,7 @@ def mounted_start(
     """
     iterations = 0
     values = prepared.mountings
-    gross = prepared.strays
+    gross = strays(prepared.trial)
     aids = mounted_aids(prepared.trial, prepared.mountings)
     if aids is not None:
         observations, parameters = observed(aids, prepared.frame, prepared.trial.body_axes)

@@ -42,7 +42,7 @@ from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
-from factorgraph_dvl.solvers.preparation import MountedStart
+from factorgraph_dvl.solvers.preparation import MountedStart, strays
 from factorgraph_dvl.trial import Trial
 
 CURRENT = "current"
@@ -180,7 +180,7 @@ class PreparationWithoutImu:
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
         """Return where the minimisation starts: motion and mountings are known by the records."""
-        return MountedStart(states, self.values, {}, 0)
+        return MountedStart(states, self.values, strays(self.trial), 0)
 
 
 def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
@@ -193,7 +193,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     DataError
         If records are too short.
     """
-    sensor, source = trial.attitude, trial.position_sensor
+    sensor, source = trial.attitude, trial.with_fixes().gnss or trial.find(Ins)
     if sensor is None or source is None:
         raise ConfigError(
             "nothing measures the position",
