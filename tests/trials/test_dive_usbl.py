@@ -100,7 +100,7 @@ def test_gross_fixes_lead_no_start_elsewhere(without_imu):
     trial = simulate(config("dive-usbl", **(WITHOUT_IMU if without_imu else {})), 12)
     spoilt = changed(trial, gross)
     found = start(spoilt)
-    assert np.linalg.norm(found.states.p_n - start(trial).states.p_n, axis=1).max() < 2.0
+    assert np.linalg.norm(found.states.p_n - start(trial).states.p_n, axis=1).max() < 5.0
     wrong = np.any(spoilt.find(Usbl).polar != trial.find(Usbl).polar, axis=1)
     np.testing.assert_array_equal(found.robust_weights["USBL"][:, 0] == 0.0, wrong)
 
