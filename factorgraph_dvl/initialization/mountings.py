@@ -1,4 +1,4 @@
-"""Start values of the sensors' mountings, from the motion without these sensors."""
+"""Start values of the sensors' mountings, from the motion without them, and what that is from."""
 
 from __future__ import annotations
 
@@ -51,6 +51,29 @@ def mounted_aids(trial: Trial, mountings: dict[str, Array]) -> list[Aid] | None:
             for p in (() if isinstance(aid, Usbl) else aid.parameters())
         )
     ]
+
+
+def strays(trial: Trial) -> dict[str, Array]:
+    """Return the weights of what a USBL measured, 0 where a start is made without the fix.
+
+    Parameters
+    ----------
+    trial : Trial
+        Its sensors.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Weights (M, 1) by label; nothing where all fixes are near their neighbours.
+    """
+    usbl, start = trial.find(Usbl), trial.on_one_clock().with_fixes().gnss
+    if usbl is None or start is None:
+        return {}
+    kept = {
+        o.label: np.isin(o.time, start.time)[:, None].astype(float)
+        for o in usbl.observations(trial.frame(), trial.body_axes)
+    }
+    return {label: weights for label, weights in kept.items() if not weights.all()}
 
 
 def mountings_from_motion(

@@ -23,14 +23,13 @@ from factorgraph_dvl.imu.propagation import States
 from factorgraph_dvl.imu.timestamps import without_restarted_clock
 from factorgraph_dvl.imu.vibration import without_vibration
 from factorgraph_dvl.initialization.in_motion_alignment import initial_states
-from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion
+from factorgraph_dvl.initialization.mountings import mounted_aids, mountings_from_motion, strays
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.star_catalogue import star_catalogue_findings
 from factorgraph_dvl.sensors.clock import on_shared_clocks
 from factorgraph_dvl.sensors.imu import ImuSettings
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation, observed
-from factorgraph_dvl.sensors.usbl import Usbl
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.motion_strengths import Strengths
@@ -248,18 +247,6 @@ def prepare(trial: Trial, state_interval_s: float, report: Progress) -> Preparat
             *start_positions.findings,
         ),
     )
-
-
-def strays(trial: Trial) -> dict[str, Array]:
-    """Return the weights of what a USBL measured, 0 where a start is made without the fix."""
-    usbl, start = trial.find(Usbl), trial.on_one_clock().with_fixes().gnss
-    if usbl is None or start is None:
-        return {}
-    kept = {
-        o.label: np.isin(o.time, start.time)[:, None].astype(float)
-        for o in usbl.observations(trial.frame(), trial.body_axes)
-    }
-    return {label: weights for label, weights in kept.items() if not weights.all()}
 
 
 @dataclass(frozen=True)

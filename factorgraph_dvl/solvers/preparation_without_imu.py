@@ -26,6 +26,7 @@ from factorgraph_dvl.graph.smooth_chain import (
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.initialization.dvl_mounting import initial_mountings
+from factorgraph_dvl.initialization.mountings import strays
 from factorgraph_dvl.initialization.record_clocks import clock_lags
 from factorgraph_dvl.initialization.track_velocity import Track, body_track
 from factorgraph_dvl.message import message
@@ -42,7 +43,7 @@ from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
-from factorgraph_dvl.solvers.preparation import MountedStart, strays
+from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
 
 CURRENT = "current"
