@@ -375,10 +375,16 @@ class PlanarChain(WithoutImu, AtTrueTimes):
             MOTION, names, block.start, residual, np.concatenate([before, after], axis=2)
         )
 
+    def epochs(self, rate_hz: float, after: float = -np.inf) -> Array:
+        """Return the epochs at a rate after a time, s, and up to the last node."""
+        first, last = self.node_time[[0, -1]]
+        time = epochs_between(max(after, first - 0.5 / rate_hz), last, rate_hz)
+        return time[time >= first]
+
     def trajectory(
-        self, states: PlanarStates, P: Array, body_axes: BodyAxes, rate_hz: float
+        self, states: PlanarStates, P: Array, body_axes: BodyAxes, time: Array
     ) -> Trajectory:
-        """Return the motion at a rate, with its covariance; headings as they are recorded.
+        """Return the motion at times (M,), s, with its covariance; headings as recorded.
 
         Parameters
         ----------
@@ -388,13 +394,11 @@ class PlanarChain(WithoutImu, AtTrueTimes):
             Their covariances.
         body_axes : BodyAxes
             Axes of the body.
-        rate_hz : float
-            Epochs in a second.
+        time : ndarray, shape (M,), s
+            The times.
         """
-        first, last = self.node_time[[0, -1]]
-        time = np.minimum(epochs_between(first - 0.5 / rate_hz, last, rate_hz), last)
-        time = time[time >= first]
         at = self.attach(time)
+        time = at.time
         begin, span = self.node_time[at.node], np.diff(self.node_time)[at.node]
         fraction = ((time - begin) / span)[:, None, None]
         of_nodes = P[at.node] + fraction * (P[at.node + 1] - P[at.node])

@@ -13,11 +13,9 @@ from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.replay.history import InertialHistory, RecordHistory
 from factorgraph_dvl.replay.navigator import Navigator
-from factorgraph_dvl.replay.navigator_without_imu import (
-    NavigatorWithoutImu,
-    StartWithoutImu,
-    solve_start_without_imu,
-)
+from factorgraph_dvl.replay.navigator_in_plane import StartInPlane, solve_start_in_plane
+from factorgraph_dvl.replay.navigator_without_imu import StartWithoutImu, solve_start_without_imu
+from factorgraph_dvl.replay.record_navigator import RecordNavigator
 from factorgraph_dvl.replay.samples import Gap
 from factorgraph_dvl.replay.start import ReplayStart, solve_start
 from factorgraph_dvl.solution import Progress
@@ -48,8 +46,8 @@ _LONGEST = 1800.0
 _ROTATION_CHANGE = 0.01
 
 
-AnyStart = ReplayStart | StartWithoutImu
-AnyNavigator = Navigator | NavigatorWithoutImu
+AnyStart = ReplayStart | StartWithoutImu | StartInPlane
+AnyNavigator = Navigator | RecordNavigator
 
 
 @dataclass(frozen=True)
@@ -215,7 +213,7 @@ class Initializer:
 
         Returns
         -------
-        ReplayStart or StartWithoutImu or None
+        AnyStart or None
             Start, None if the data do not allow one yet.
         ClockJump or None
             Jump of the IMU's clock, if that explains the data and a gap does not.
@@ -266,6 +264,8 @@ class Initializer:
             if self._clock_zero is None:
                 self._clock_zero = self.history.start
             report, zero = self._progress, self._clock_zero
+            if trial.planar:
+                return solve_start_in_plane(trial, since, report, zero)
             if trial.imu is None:
                 return solve_start_without_imu(trial, until, since, report, zero)
             return solve_start(trial, self._prior, self._interval, since, report, zero)

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.records import concatenated
-from factorgraph_dvl.geometry.rotations import BodyAxes, exp_so3
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, rotate
+from factorgraph_dvl.geometry.rotations import exp_so3
+from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.smooth_chain import SmoothChain, far_apart, without_long_steps
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Finding
-from factorgraph_dvl.replay.calibration import CalibrationEstimate, CalibrationReport
-from factorgraph_dvl.replay.gate import InnovationGate, judged
+from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.history import RecordHistory
-from factorgraph_dvl.replay.record import Innovations
+from factorgraph_dvl.replay.record_navigator import RecordNavigator
 from factorgraph_dvl.replay.start import largest_misfit
 from factorgraph_dvl.replay.window import (
     BatchSolution,
     Past,
     Window,
     WindowChain,
-    information_without,
     stepped,
 )
 from factorgraph_dvl.sensors.protocol import Observation
@@ -143,7 +139,7 @@ def solve_start_without_imu(
     )
 
 
-class NavigatorWithoutImu:
+class NavigatorWithoutImu(RecordNavigator):
     """Navigation between two batch solutions: a window of nodes, and what is known before it.
 
     The noise of sensors and the strengths of motion and current are those of the batch solution.
@@ -158,26 +154,16 @@ class NavigatorWithoutImu:
         Gate that decides which measurements are used.
     lag : float
         Age beyond which states are no longer corrected, s.
-    before : NavigatorWithoutImu, optional
+    before : RecordNavigator, optional
         What ran before.
 
     Attributes
     ----------
     window : Window
         The newest nodes.
-    frame : LocalFrame
-        Navigation frame of the nodes.
-    first_motion : Trajectory
-        Motion that the start has found.
-    rotation_change : float
-        None that counts: every window is linear where the constants are.
-    innovations : list of Innovations
-        Innovations since they were last taken.
-    findings : list of Finding
-        Findings since they were last taken.
     """
 
-    rotation_change = 0.0
+    window: Window
 
     def __init__(
         self,
@@ -185,21 +171,21 @@ class NavigatorWithoutImu:
         gate: InnovationGate,
         *,
         lag: float,
-        before: NavigatorWithoutImu | None = None,
+        before: RecordNavigator | None = None,
     ) -> None:
-        self._batch = start.batch
-        self.frame, self.first_motion = start.frame, start.trajectory
-        self._gate, self._lag = gate, lag
-        self.innovations: list[Innovations] = []
-        self.findings: list[Finding] = []
         whole, chain = start.whole, start.whole.chain
-        # By label, times of measurements that are not used, and of the last one that was compared
-        # with a prediction; by section, that of the last row that is before the window.
-        self._rejected = _left_out(whole.problem)
-        self._compared: dict[str, float] = {} if before is None else before._compared
+        super().__init__(
+            whole,
+            start.frame,
+            start.trajectory,
+            gate,
+            lag=lag,
+            body_axes=start.batch.trial.body_axes,
+            before=before,
+        )
+        self._batch = start.batch
+        # By section, time of the last row that is before the window.
         self._since: dict[str, float] = {}
-        self._smoothed: list[Trajectory] = [] if before is None else before._smoothed
-        self._smoothed_to: float = -np.inf if before is None else before._smoothed_to
         first = self._first_node(chain.node_time[: start.count])
         self._smooth(whole, min(first + 1, start.count - 1))
         past = self._leave(whole, first)
@@ -212,14 +198,8 @@ class NavigatorWithoutImu:
             whole.values,
             self._batch.trial,
         )
-        self.window = stepped(problem, at)
-        for bound in problem.bound:
-            self._note_compared(bound.observation, bound.usable)
-
-    @property
-    def time(self) -> float:
-        """True time up to which the motion is known, s."""
-        return self.window.now
+        self.window = stepped(problem, at, Window)
+        self._note_compared(problem, {b.observation.label: b.usable for b in problem.bound})
 
     def advance(self, history: RecordHistory, until: float, *, end: bool) -> bool:
         """Go on by the records up to a time, s; return whether these allow it."""
@@ -267,48 +247,8 @@ class NavigatorWithoutImu:
             window.values,
             records,
         )
-        new = {
-            b.observation.label: b.usable
-            & (b.weight > 0.0).any(axis=1)
-            & (b.observation.time > self._compared.get(b.observation.label, -np.inf))
-            for b in problem.bound
-        }
-        found = judged(problem, at, information_without(problem, at, new), new, self._gate)
-        self.innovations += found.innovations
-        self.findings += found.findings
-        for label, times in found.rejected.items():
-            self._rejected[label] = np.union1d(self._rejected.get(label, times), times)
-        for bound in problem.bound:
-            self._note_compared(bound.observation, new[bound.observation.label])
-        problem.reject(self._rejected)
-        self.window = stepped(problem, at)
-
-    def find_calibration(self) -> Callable[[], CalibrationEstimate]:
-        """Return what computes the calibration that is known now, whenever it is called."""
-        window = self.window
-        report = CalibrationReport(window.problem.all_parameters)
-
-        def calibration() -> CalibrationEstimate:
-            P = window.constants
-            return report.at(window.values, np.empty(0), P, np.zeros((len(P), 0)))
-
-        return calibration
-
-    def newest(self, body_axes: BodyAxes) -> Callable[[], Trajectory]:
-        """Return what computes the newest state as known now, as a trajectory of one epoch."""
-        return partial(self.window.newest, body_axes)
-
-    def last_segment(self, body_axes: BodyAxes, since: float) -> Callable[[], Trajectory]:
-        """Return what computes the motion as known now, at the epochs after a time, s."""
-        return partial(self.window.motion, since, self.window.last, body_axes)
-
-    def smoothed(self, body_axes: BodyAxes, *, rest: bool = False) -> Trajectory | None:
-        """Return smoothed motion that was not returned before: what has left, or all the rest."""
-        if rest:
-            self._smooth(self.window, self.window.last)
-        found = concatenated(self._smoothed) if self._smoothed else None
-        self._smoothed.clear()
-        return found
+        self._judge(problem, at)
+        self.window = stepped(problem, at, Window)
 
     def _problem(
         self,
@@ -397,18 +337,6 @@ class NavigatorWithoutImu:
         """Return the oldest node within the lag; two stay at least."""
         return min(int(np.searchsorted(time, time[-1] - self._lag)), time.size - 2)
 
-    def _note_compared(self, o: Observation, which: BoolArray) -> None:
-        """Take notice of measurements that have been compared with a prediction."""
-        if which.any():
-            last = float(o.time[which][-1])
-            self._compared[o.label] = max(last, self._compared.get(o.label, last))
-
-    def _smooth(self, window: Window, node: int) -> None:
-        """Keep the smoothed motion up to a node that no update has carried."""
-        found = window.motion(self._smoothed_to, node, self._batch.trial.body_axes)
-        self._smoothed_to = float(np.max(found.time, initial=self._smoothed_to))
-        self._smoothed.append(found)
-
 
 def _latest(window: Window, records: Trial, until: float, *, end: bool) -> float:
     """Return the time up to which all have reported at a time, s, by the nodes' clock."""
@@ -465,14 +393,3 @@ def _going_on_straight(
     new = (body.nRb, p_n, v_n, body.omega_eb_b)
     old = (states.nRb, states.p_n, states.v_n, states.omega_b)
     return SmoothStates(*(np.concatenate([a, b]) for a, b in zip(old, new, strict=True)))
-
-
-def _left_out(problem: Problem) -> dict[str, Array]:
-    """Return the times of the measurements that a batch solution left out, by label."""
-    out = dict(problem.rejected)
-    for o in problem.observations:
-        weight = problem.robust_weights.get(o.label)
-        if weight is not None:
-            none = o.time[np.all(weight == 0.0, axis=1)]
-            out[o.label] = np.union1d(out.get(o.label, none), none)
-    return out

@@ -30,8 +30,10 @@ from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.history import InertialHistory
 from factorgraph_dvl.replay.initializer import AnyNavigator, Initializer
 from factorgraph_dvl.replay.navigator import Navigator
+from factorgraph_dvl.replay.navigator_in_plane import NavigatorInPlane, StartInPlane
 from factorgraph_dvl.replay.navigator_without_imu import DELAY, NavigatorWithoutImu
 from factorgraph_dvl.replay.record import Update
+from factorgraph_dvl.replay.record_navigator import RecordNavigator
 from factorgraph_dvl.replay.samples import Gap, SampleBuffer
 from factorgraph_dvl.replay.start import ReplayStart
 from factorgraph_dvl.sensors.protocol import Aid, ClocksAid
@@ -74,7 +76,7 @@ class Replay:
     Raises
     ------
     ConfigError
-        If an option is out of range, or the trial one in the plane.
+        If an option is out of range.
 
     Examples
     --------
@@ -103,13 +105,6 @@ class Replay:
         for name, value in (("lag_s", lag_s), ("rate_hz", rate_hz)):
             if not (np.isfinite(value) and value > 0.0):
                 raise ConfigError(f"{name} is {value}", expected="a number above 0")
-        if settings.planar:
-            raise ConfigError(
-                "a replay needs the attitude, which heading and log do not have",
-                where="trial.yaml",
-                expected="an `imu`, `ins` or `attitude` section",
-                hint="Ranges leave several tracks open, often to the end: `solve` weighs them",
-            )
         if settings.imu is None and smoother != "fixed-lag":
             raise ConfigError(
                 f"smoother is {smoother!r}, which needs an IMU",
@@ -146,6 +141,8 @@ class Replay:
     @property
     def delay(self) -> float:
         """Time by which estimates are behind the newest IMU sample, or the records, s."""
+        if self._settings.planar:
+            return 0.0
         return DELAY if self._settings.imu is None else self._samples.delay
 
     @property
@@ -297,14 +294,16 @@ class Replay:
                 elif end and until >= self._arrived:
                     return
                 continue
+            last = None
             if end and self._settings.imu is None and self._initializer.knew_less(self._reached):
-                # States are behind the records: they go on from the last solution to the end.
-                nav = self._solve_again(nav) or nav
+                # Where states are behind the records, they go on from this solution to the end.
+                last = self._solve_again(nav)
+                nav = last or nav
             extended = self._extend(nav, end=end)
             if isinstance(extended, Gap):
                 self._restart(nav, extended)
                 continue
-            if not extended:
+            if not extended and last is None:
                 return
             if self._initializer.history is not None:
                 for i in nav.innovations:
@@ -316,7 +315,7 @@ class Replay:
                 end and not self.settled and self._is_last(nav.time)
             )
             again = self._solve_again(nav) if due else None
-            known, solved = (nav, False) if again is None else (again, True)
+            known, solved = (nav, last is not None) if again is None else (again, True)
             yield self._update(known, began, trajectory, solved=solved, end=end)
 
     @property
@@ -338,7 +337,7 @@ class Replay:
 
     def _extend(self, nav: AnyNavigator, *, end: bool) -> bool | Gap:
         """Extend a navigator; return whether what has arrived does, or the gap that follows."""
-        if isinstance(nav, NavigatorWithoutImu):
+        if isinstance(nav, RecordNavigator):
             assert self._initializer.history is not None
             return nav.advance(self._initializer.history, self._reached, end=end)
         wanted = self._next_own_state(nav)
@@ -396,13 +395,16 @@ class Replay:
         self._deferred.clear()
         self._noise = start.noise
         if isinstance(start, ReplayStart):
-            lag = self._lag if self._kind == "fixed-lag" else None
-            self._navigator = Navigator(start, self._gate, lag=lag, memory=self._lag)
+            kept = self._lag if self._kind == "fixed-lag" else None
+            self._navigator = Navigator(start, self._gate, lag=kept, memory=self._lag)
             self._samples.smoothing, self._samples.longest = start.smoothing, start.longest
         else:
-            before = self._navigator
-            assert before is None or isinstance(before, NavigatorWithoutImu)
-            self._navigator = NavigatorWithoutImu(start, self._gate, lag=self._lag, before=before)
+            before, lag = self._navigator, self._lag
+            assert not isinstance(before, Navigator)
+            if isinstance(start, StartInPlane):
+                self._navigator = NavigatorInPlane(start, self._gate, lag=lag, before=before)
+            else:
+                self._navigator = NavigatorWithoutImu(start, self._gate, lag=lag, before=before)
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.
         gc.collect()
         gc.freeze()

@@ -26,6 +26,7 @@ from factorgraph_dvl.sensors.protocol import AttitudeAid
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.correlated_noise import noise_of
+from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.posterior import Posterior, posterior
 from factorgraph_dvl.solvers.rounds import SettledMinimum
 from factorgraph_dvl.solvers.state_times import needs_states
@@ -176,19 +177,24 @@ def solve_start(
         constants_prior=known,
         clock_zero=clock_zero,
     )
-    problem, minimum = settled.problem, settled.minimum
+    why = not_one_minimum(settled, start_positions)
+    if why is not None:
+        return why
+    covariances = posterior(settled.problem, settled.minimum)
+    unsure = _not_linear(trial, covariances.nodes[-1])
+    if unsure is not None:
+        return unsure
+    return _condensed(trial, settled, covariances, interval, since, clock_zero)
+
+
+def not_one_minimum(settled: SettledMinimum, start_positions: StartPositions) -> Message | None:
+    """Return why the records so far do not lead to one minimum, None if they do."""
     if len(start_positions.states) > 1:
         return message("not_started.ambiguous", count=len(start_positions.states))
     if start_positions.findings:
         first = start_positions.findings[0].message
         return message("not_started.error", error=first)
-    if not minimum.converged:
-        return message("not_started.not_converged")
-    covariances = posterior(problem, minimum)
-    unsure = _not_linear(trial, covariances.nodes[-1])
-    if unsure is not None:
-        return unsure
-    return _condensed(trial, settled, covariances, interval, since, clock_zero)
+    return None if settled.minimum.converged else message("not_started.not_converged")
 
 
 def _condensed(

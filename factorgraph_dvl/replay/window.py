@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -298,7 +299,7 @@ class Past:
 
 
 @dataclass(frozen=True)
-class Window:
+class SteppedNodes:
     """Nodes and where a step of their problem led; also those of a batch solution.
 
     Parameters
@@ -316,6 +317,55 @@ class Window:
     information: SquareRootInformation
 
     @property
+    def last(self) -> int:
+        """The last node at which something was measured."""
+        raise NotImplementedError
+
+    @property
+    def now(self) -> float:
+        """True time up to which the motion is known, s."""
+        raise NotImplementedError
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Values of parameters, and of the nodes of processes."""
+        return self.evaluation.parameters
+
+    @cached_property
+    def constants(self) -> Array:
+        """Covariance (P, P) of the parameters, in their tangent space, SI."""
+        root = self.problem.prior_root
+        return np.asarray(root @ self._posterior.parameters @ root.T)
+
+    @cached_property
+    def _posterior(self) -> Posterior:
+        return posterior(self.problem, Minimum(self.evaluation, self.information, True, 0))
+
+    def newest(self, body_axes: BodyAxes) -> Trajectory:
+        """Return the newest motion that is known, as a trajectory of one epoch."""
+        return self._at(np.array([self.now]), body_axes)
+
+    def motion(self, since: float, last: int, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion after a true time, s, and up to a node."""
+        return self._at(self._epochs(since, last), body_axes)
+
+    def _epochs(self, since: float, last: int) -> Array:
+        """Return the epochs after a true time, s, and up to a node."""
+        raise NotImplementedError
+
+    def _at(self, time: Array, body_axes: BodyAxes) -> Trajectory:
+        """Return the motion at true times (M,), s."""
+        raise NotImplementedError
+
+
+AnyNodes = TypeVar("AnyNodes", bound=SteppedNodes)
+
+
+@dataclass(frozen=True)
+class Window(SteppedNodes):
+    """Nodes of a smooth motion, the newest or all."""
+
+    @property
     def chain(self) -> SmoothChain:
         """The nodes."""
         chain = self.problem.chain
@@ -328,11 +378,6 @@ class Window:
         return self.chain.node_time.size - 2
 
     @property
-    def values(self) -> dict[str, Array]:
-        """Values of parameters, and of the nodes of processes."""
-        return self.evaluation.parameters
-
-    @property
     def lag(self) -> float:
         """Times of the nodes less true times, s."""
         return nodes_late(self.chain, self.values)
@@ -343,30 +388,14 @@ class Window:
         return known_span(self.chain, self.values)[1]
 
     @cached_property
-    def constants(self) -> Array:
-        """Covariance (P, P) of the parameters, in their tangent space, SI."""
-        root = self.problem.prior_root
-        return np.asarray(root @ self._posterior.parameters @ root.T)
-
-    @cached_property
     def states(self) -> Array:
         """Covariances (K, 3, 3, 3) of the states in n where the true times are exact."""
         return covariances_at_true_times(self.problem, self.evaluation, self._posterior)
 
-    @cached_property
-    def _posterior(self) -> Posterior:
-        return posterior(self.problem, Minimum(self.evaluation, self.information, True, 0))
-
-    def newest(self, body_axes: BodyAxes) -> Trajectory:
-        """Return the newest motion that is known, as a trajectory of one epoch."""
-        return self._at(np.array([self.now]), body_axes)
-
-    def motion(self, since: float, last: int, body_axes: BodyAxes) -> Trajectory:
-        """Return the motion after a true time, s, and up to a node."""
+    def _epochs(self, since: float, last: int) -> Array:
         first, end = known_span(self.chain, self.values)
         end = min(float(self.chain.node_time[last]) - self.lag, end)
-        epochs = epochs_at_most(self.chain, max(since, first), end, TRAJECTORY_RATE)
-        return self._at(epochs, body_axes)
+        return epochs_at_most(self.chain, max(since, first), end, TRAJECTORY_RATE)
 
     def _at(self, time: Array, body_axes: BodyAxes) -> Trajectory:
         return motion_at_true_times(self.chain, self.evaluation, self.states, body_axes, time)
@@ -464,8 +493,8 @@ def information_without(
     return information
 
 
-def stepped(problem: Problem, at: Evaluation) -> Window:
-    """Return a window after Gauss-Newton steps.
+def stepped(problem: Problem, at: Evaluation, of: type[AnyNodes]) -> AnyNodes:
+    """Return nodes after Gauss-Newton steps.
 
     The second is for the newest states: where they are only predicted, turns seem to say more of
     clocks than they do.
@@ -474,7 +503,7 @@ def stepped(problem: Problem, at: Evaluation) -> Window:
         at = problem.weighed(at)
         information = _eliminated(problem, at)
         at = problem.evaluate(at.values.retract(information.solution()))
-    return Window(problem, at, information)
+    return of(problem, at, information)
 
 
 def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:

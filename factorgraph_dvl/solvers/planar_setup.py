@@ -18,8 +18,8 @@ from factorgraph_dvl.ranging.dead_reckoning import DeadReckoning, dead_reckoned
 from factorgraph_dvl.ranging.search import RangingRows, ranging_rows
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Observation
-from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
+from factorgraph_dvl.solvers.posterior import Posterior
 from factorgraph_dvl.trial import Trial
 
 # Time between nodes, s, at least. Chosen: a vehicle does not turn in less.
@@ -105,7 +105,8 @@ class Track:
         every = chain.keys_of(range(len(self.x)))
         found = information.marginals(every)
         P = np.stack([found[key] for key in every])
-        return chain.trajectory(self.evaluation.states, P, chain.body_axes, rate_hz)
+        time = chain.epochs(rate_hz)
+        return chain.trajectory(self.evaluation.states, P, chain.body_axes, time)
 
 
 @dataclass(frozen=True)
@@ -165,12 +166,15 @@ class PlanarSetup:
 
     def carried(self, earlier: Track, nodes: int) -> Array:
         """Return the states of a track, dead-reckoned on to more nodes, or cut."""
-        x = earlier.x[:nodes]
-        if nodes <= len(x):
+        chain, time = earlier.problem.chain, self.chain.node_time[:nodes]
+        count = max(int(np.searchsorted(time, chain.node_time[-1], side="right")), 1)
+        there = chain.motion(chain.attach(time[:count]), earlier.evaluation.states)
+        x = np.hstack([there.p_n[:, :2], there.v_n[:, :2]])
+        if count == nodes:
             return x
         on = self.reckoned(np.zeros(2), earlier.values, nodes)
-        on[:, :2] += x[-1, :2] - on[len(x) - 1, :2]
-        return np.concatenate([x, on[len(x) :]])
+        on[:, :2] += x[-1, :2] - on[count - 1, :2]
+        return np.concatenate([x, on[count:]])
 
     def fitted(
         self, x: Array, values: Mapping[str, Array], rejected: Mapping[str, Array]
@@ -286,26 +290,29 @@ def planar_setup(trial: Trial, frame: LocalFrame) -> PlanarSetup:
     return PlanarSetup(trial, track, chain, observations, initial is not None)
 
 
-def planar_trajectory(found: SolvedProblem, chain: PlanarChain, rate_hz: float) -> Trajectory:
-    """Return the motion at a rate, with headings less their constant error.
+def planar_trajectory(problem: Problem, at: Evaluation, P: Posterior, time: Array) -> Trajectory:
+    """Return the motion at times (M,), s, with headings less their constant error.
 
     Parameters
     ----------
-    found : SolvedProblem
-        Solved problem of a planar chain, at its minimum.
-    chain : PlanarChain
-        Its chain.
-    rate_hz : float
-        Epochs in a second.
+    problem : Problem
+        Problem of a planar chain.
+    at : Evaluation
+        Its minimum.
+    P : Posterior
+        Covariances there.
+    time : ndarray, shape (M,), s
+        The times.
     """
-    at, P = found.minimum.evaluation, found.covariances
-    out = chain.trajectory(at.states, P.nodes, chain.body_axes, rate_hz)
+    chain = problem.chain
+    assert isinstance(chain, PlanarChain)
+    out = chain.trajectory(at.states, P.nodes, chain.body_axes, time)
     bias = chain.heading_bias
-    if bias not in found.problem.columns:
+    if bias not in problem.columns:
         return out
     rph, rph_cov = out.rph.copy(), out.rph_cov.copy()
     rph[:, 2] = (rph[:, 2] - at.parameters[bias][0]) % (2.0 * np.pi)
-    root = found.problem.prior_root[found.problem.columns[bias]][0]
+    root = problem.prior_root[problem.columns[bias]][0]
     rph_cov[:, 2, 2] += root @ P.parameters @ root
     return replace(out, rph=rph, rph_cov=rph_cov)
 

@@ -104,7 +104,8 @@ def trajectory(found: SolvedProblem, body_axes: BodyAxes, rate_hz: float) -> Tra
     """Return the motion at a rate, at true times."""
     chain = found.problem.chain
     if isinstance(chain, PlanarChain):
-        return planar_trajectory(found, chain, rate_hz)
+        at, P = found.minimum.evaluation, found.covariances
+        return planar_trajectory(found.problem, at, P, chain.epochs(rate_hz))
     if isinstance(chain, SmoothChain):
         at = found.minimum.evaluation
         return trajectory_at_true_times(found.problem, at, found.covariances, body_axes, rate_hz)
