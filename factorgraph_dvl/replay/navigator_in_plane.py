@@ -36,10 +36,6 @@ from factorgraph_dvl.solvers.planar_setup import (
 )
 from factorgraph_dvl.trial import Trial
 
-# Longest time, s, by which records are to go on at once, if they allow less. Chosen: measurements
-# are compared with what those before them predict.
-_AT_ONCE = 5.0
-
 
 @dataclass(frozen=True)
 class PlanarNodes(SteppedNodes):
@@ -166,6 +162,8 @@ class NavigatorInPlane(RecordNavigator):
         Batch solution to start from.
     gate : InnovationGate
         Gate that decides which measurements are used.
+    interval : float
+        Time between updates, s.
     lag : float
         Age from which on motion counts as smoothed, s.
     before : RecordNavigator, optional
@@ -179,6 +177,7 @@ class NavigatorInPlane(RecordNavigator):
         start: StartInPlane,
         gate: InnovationGate,
         *,
+        interval: float,
         lag: float,
         before: RecordNavigator | None = None,
     ) -> None:
@@ -191,6 +190,7 @@ class NavigatorInPlane(RecordNavigator):
             body_axes=start.trial.body_axes,
             before=before,
         )
+        self._interval = interval
         problem = start.whole.problem
         self._parameters, self._clock_zero = problem.all_parameters, problem.clock_zero
         self._note_compared(problem, {b.observation.label: b.usable for b in problem.bound})
@@ -198,7 +198,8 @@ class NavigatorInPlane(RecordNavigator):
 
     def advance(self, history: RecordHistory, until: float, *, end: bool) -> bool:
         """Go on by the records up to a time, s; return whether these allow it."""
-        for time in (min(until, self.time + _AT_ONCE), until):
+        # Measurements are compared with what those shortly before them predict.
+        for time in (min(until, self.time + self._interval), until):
             setup = planar_setup(history.trial(time), self.frame)
             if setup.chain.node_time[-1] > self.time:
                 self._extend(setup)

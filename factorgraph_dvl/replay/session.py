@@ -402,7 +402,9 @@ class Replay:
             before, lag = self._navigator, self._lag
             assert not isinstance(before, Navigator)
             if isinstance(start, StartInPlane):
-                self._navigator = NavigatorInPlane(start, self._gate, lag=lag, before=before)
+                self._navigator = NavigatorInPlane(
+                    start, self._gate, interval=self._interval, lag=lag, before=before
+                )
             else:
                 self._navigator = NavigatorWithoutImu(start, self._gate, lag=lag, before=before)
         # What is there now stays: to look for cycles in it again takes 5 ms of some updates.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import planar
 import pytest
 from findings import of_code
 from rich.console import Console
@@ -342,11 +341,6 @@ def test_what_never_starts_says_why():
         Replay(trial, smoother="kalman")
     with pytest.raises(ConfigError, match="no IMU"):
         Replay(replace(trial, imu=None)).add_imu(0.0, np.zeros(3), np.zeros(3))
-
-
-def test_a_track_in_the_plane_is_refused_with_what_to_do():
-    with pytest.raises(ConfigError, match=r"several tracks open.*`solve`"):
-        replay(planar.trial())
 
 
 def test_the_command_writes_what_was_known_when(trial, tmp_path, capsys):
