@@ -68,7 +68,7 @@ class CalibrationReport:
                 continue
             self._varying.append((p, own, columns[p.name]))
             self._derivative[own, columns[p.name]] = np.eye(p.mean.size) / p.si
-        self._exact = np.concatenate([p.sigma == 0.0 for p in rows])
+        self._exact = np.concatenate([np.empty(0, bool), *(p.sigma == 0.0 for p in rows)])
 
     def at(
         self, values: Mapping[str, Array], bias: Array, P: Array, undetermined: Array

@@ -1,33 +1,36 @@
-"""Navigation in the plane: a batch solution, and steps of the whole problem as records grow.
+"""Navigation in the plane: a batch solution, and the whole problem anew as records grow.
 
-A node has four numbers. So all nodes stay, and each step is one of the problem that `solve` makes
-of the records so far: nothing is linear at an old state, and a measurement that comes late counts
-as if it had come in time.
+A node has four numbers. So all nodes stay, and each update minimises the problem that `solve`
+makes of the records so far, from where the last one ended: nothing is linear at an old state, and
+a measurement that comes late counts as if it had come in time.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from factorgraph_dvl.estimates import Noise, Trajectory
+from factorgraph_dvl.estimates import Noise, Trajectory, mixed
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
-from factorgraph_dvl.message import Message, message
+from factorgraph_dvl.message import Message
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.history import RecordHistory
 from factorgraph_dvl.replay.record_navigator import RecordNavigator
 from factorgraph_dvl.replay.start import largest_misfit, not_one_minimum
-from factorgraph_dvl.replay.window import SteppedNodes, stepped
+from factorgraph_dvl.replay.window import SteppedNodes
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.batch import settled_minimum
-from factorgraph_dvl.solvers.curved_posterior import is_curved
+from factorgraph_dvl.solvers.curved_posterior import points_along_arc
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.planar_setup import (
     PlanarSetup,
     Track,
@@ -39,7 +42,15 @@ from factorgraph_dvl.trial import Trial
 
 @dataclass(frozen=True)
 class PlanarNodes(SteppedNodes):
-    """All nodes so far."""
+    """All nodes so far, at a minimum.
+
+    Parameters
+    ----------
+    places : ndarray, shape (B, 2), m
+        Places of the beacons, east and north.
+    """
+
+    places: Array = field(kw_only=True)
 
     @property
     def chain(self) -> PlanarChain:
@@ -58,17 +69,39 @@ class PlanarNodes(SteppedNodes):
         """Time of the last node, s."""
         return float(self.chain.node_time[-1])
 
-    @property
-    def first_position(self) -> Array:
-        """Covariance of the first position, (2, 2), m²."""
-        return np.asarray(self._posterior.nodes[0][:2, :2])
+    @cached_property
+    def constants(self) -> Array:
+        """Covariance (P, P) of the parameters, SI, with their spread along an arc."""
+        points, weights = self._points
+        P = np.zeros_like(self._posterior.parameters)
+        for point, weight in zip(points, weights, strict=True):
+            root, own = point.problem.prior_root, point.minimum.evaluation.parameters
+            off = [own[p.name] - self.values[p.name] for p in self.problem.parameters]
+            apart = np.concatenate([np.empty(0), *off])
+            P += weight * (root @ point.covariances.parameters @ root.T + np.outer(apart, apart))
+        return P
+
+    @cached_property
+    def _points(self) -> tuple[list[SolvedProblem], Array]:
+        """Tracks along the arc that ranges leave, and their weights; one where it is straight."""
+        minimum = Minimum(self.evaluation, self.information, converged=True, iterations=0)
+        none = np.zeros((len(self._posterior.parameters), 0))
+        found = SolvedProblem(self.problem, minimum, self._posterior, none)
+        points, costs = points_along_arc(found, self.places, lambda *_: None)
+        weights = np.exp(costs[0] - costs)
+        return points, weights / weights.sum()
 
     def _epochs(self, since: float, last: int) -> Array:
         time = self.chain.epochs(TRAJECTORY_RATE, since)
         return time[time <= self.chain.node_time[last]]
 
     def _at(self, time: Array, body_axes: BodyAxes) -> Trajectory:
-        return planar_trajectory(self.problem, self.evaluation, self._posterior, time)
+        points, weights = self._points
+        tracks = [
+            planar_trajectory(each.problem, each.minimum.evaluation, each.covariances, time)
+            for each in points
+        ]
+        return mixed(tracks, weights) if time.size else tracks[0]
 
 
 @dataclass(frozen=True)
@@ -125,7 +158,7 @@ def solve_start_in_plane(
     Returns
     -------
     StartInPlane or Message
-        Start, or why there is none yet: ranges allow several tracks, or an arc of them.
+        Start, or why there is none yet: the ranges may allow several tracks.
 
     Raises
     ------
@@ -137,13 +170,9 @@ def solve_start_in_plane(
     if why is not None:
         return why
     problem, evaluation = settled.problem, settled.minimum.evaluation
-    whole = PlanarNodes(problem, evaluation, settled.minimum.information)
     assert trial.beacons is not None
-    P, frame = whole.first_position, whole.chain.frame
-    places = np.array(frame.position(*trial.beacons.places.T))[:, :2]
-    if is_curved(P, np.linalg.norm(places - evaluation.states.x[0, :2], axis=1)):
-        std = float(np.sqrt(np.linalg.eigvalsh(P)[-1]))
-        return message("not_started.position", std=std)
+    places = problem.chain.frame.position(*trial.beacons.places.T)[:, :2]
+    whole = PlanarNodes(problem, evaluation, settled.minimum.information, places=places)
     return StartInPlane(
         whole,
         trial,
@@ -217,7 +246,10 @@ class NavigatorInPlane(RecordNavigator):
         problem.reject(self._rejected)
         at = problem.weighed(problem.evaluate(problem.values(states, values)))
         self._judge(problem, at)
-        self.window = stepped(problem, at, PlanarNodes)
+        minimum = minimise(problem, at.values, stage="all sensors")
+        self.window = PlanarNodes(
+            problem, minimum.evaluation, minimum.information, places=self.window.places
+        )
         # What is an echo shows better with all that was measured.
         echoes = problem.outliers(self.window.evaluation)
         for o in setup.observations:

@@ -198,7 +198,7 @@ class NavigatorWithoutImu(RecordNavigator):
             whole.values,
             self._batch.trial,
         )
-        self.window = stepped(problem, at, Window)
+        self.window = stepped(problem, at)
         self._note_compared(problem, {b.observation.label: b.usable for b in problem.bound})
 
     def advance(self, history: RecordHistory, until: float, *, end: bool) -> bool:
@@ -248,7 +248,7 @@ class NavigatorWithoutImu(RecordNavigator):
             records,
         )
         self._judge(problem, at)
-        self.window = stepped(problem, at, Window)
+        self.window = stepped(problem, at)
 
     def _problem(
         self,

@@ -156,8 +156,8 @@ class Recorder:
         names = tuple(name for e in estimates for name in e.component_names)
         if not self._estimates or self._estimates[-1][0] != names:
             self._estimates.append((names, array("d")))
-        values = np.concatenate([e.value for e in estimates])
-        std = np.concatenate([e.std for e in estimates])
+        values = np.concatenate([np.empty(0), *(e.value for e in estimates)])
+        std = np.concatenate([np.empty(0), *(e.std for e in estimates)])
         head = [update.time, update.latency, update.solved, bool(update.inconsistent)]
         self._estimates[-1][1].extend([*head, *values, *std])
         _append(self._trajectory, update.trajectory)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -358,9 +357,6 @@ class SteppedNodes:
         raise NotImplementedError
 
 
-AnyNodes = TypeVar("AnyNodes", bound=SteppedNodes)
-
-
 @dataclass(frozen=True)
 class Window(SteppedNodes):
     """Nodes of a smooth motion, the newest or all."""
@@ -493,8 +489,8 @@ def information_without(
     return information
 
 
-def stepped(problem: Problem, at: Evaluation, of: type[AnyNodes]) -> AnyNodes:
-    """Return nodes after Gauss-Newton steps.
+def stepped(problem: Problem, at: Evaluation) -> Window:
+    """Return a window after Gauss-Newton steps.
 
     The second is for the newest states: where they are only predicted, turns seem to say more of
     clocks than they do.
@@ -503,7 +499,7 @@ def stepped(problem: Problem, at: Evaluation, of: type[AnyNodes]) -> AnyNodes:
         at = problem.weighed(at)
         information = _eliminated(problem, at)
         at = problem.evaluate(at.values.retract(information.solution()))
-    return of(problem, at, information)
+    return Window(problem, at, information)
 
 
 def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:

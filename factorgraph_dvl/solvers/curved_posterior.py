@@ -56,7 +56,7 @@ def points_along_arc(
     evaluation = found.minimum.evaluation
     P = found.covariances.nodes[0][:2, :2]
     first = evaluation.states.x[0, :2]
-    if not found.minimum.converged or not is_curved(P, np.linalg.norm(places - first, axis=1)):
+    if not found.minimum.converged or not _is_curved(P, np.linalg.norm(places - first, axis=1)):
         return [found], np.zeros(1)
     values, vectors = np.linalg.eigh(P)
     along, step = vectors[:, 1], float(np.sqrt(values[1])) * _SPACING
@@ -83,16 +83,8 @@ def points_along_arc(
     return [out[i] for i in order], np.array(costs)[order]
 
 
-def is_curved(P: Array, distances: Array) -> bool:
-    """Whether the arc around the nearest beacon leaves the ellipse of the first position.
-
-    Parameters
-    ----------
-    P : ndarray, shape (2, 2), m²
-        Covariance of the position.
-    distances : ndarray, shape (B,), m
-        Its distances from the beacons.
-    """
+def _is_curved(P: Array, distances: Array) -> bool:
+    """Whether the arc around the nearest beacon leaves the ellipse of the first position."""
     values = np.linalg.eigvalsh(P)
     return bool(values[1] / (2.0 * distances.min()) > _CURVED * np.sqrt(values[0]))
 

@@ -7,7 +7,7 @@ import pytest
 from planar import STRAIGHT, trial
 
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.curved_posterior import is_curved, points_along_arc
+from factorgraph_dvl.solvers.curved_posterior import _is_curved, points_along_arc
 from factorgraph_dvl.solvers.planar_setup import planar_setup
 
 
@@ -40,5 +40,5 @@ def test_a_straight_run_tells_no_more_of_the_current_than_its_prior():
 def test_an_arc_counts_as_curved_by_its_height_over_the_chord():
     # 10 m along an arc of radius 100 m is 0.5 m over the chord: more than 0.3 of 1 m across.
     P = np.diag([10.0**2, 1.0])
-    assert is_curved(P, np.array([100.0, 500.0]))
-    assert not is_curved(P, np.array([200.0, 500.0]))
+    assert _is_curved(P, np.array([100.0, 500.0]))
+    assert not _is_curved(P, np.array([200.0, 500.0]))
