@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planar import STRAIGHT, changed, setup_of, trial
+from planar import STRAIGHT, changed, setup_of, trial, true_state
 
 from factorgraph_dvl.errors import DataError, SolveError
 from factorgraph_dvl.plausibility.survey import survey
 from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.planar_setup import Track
 
 SHORT = {"manoeuvres": [{"straight_s": 30}, {"turn_deg_s": 2, "duration_s": 30}]}
 
@@ -24,6 +26,32 @@ def test_a_range_at_the_very_end_but_for_rounding_is_no_step_of_its_own():
     setup = setup_of(changed(t, replace(b, time=ends)))
     assert np.diff(setup.chain.node_time).min() > 0.5
     assert solve(changed(t, replace(b, time=ends)), rate_hz=1.0).converged
+
+
+def test_a_track_goes_on_at_other_nodes_by_dead_reckoning():
+    """Where it was at new nodes, and from its end on by what heading and log say since."""
+    t = trial()
+    x, values = true_state(t, setup_of(t))
+    early = setup_of(t.until(101.0))
+    problem = early.problem(early.chain.node_time.size, {})
+    count = problem.chain.node_time.size
+    states = early.chain.with_recorded(problem.chain.node_time, x[:count])
+    track = Track(problem, problem.evaluate(problem.values(states, values)), converged=True)
+    heading, log = t.records[:2]
+    every_other = [rows_of(record, slice(0, None, 2)) for record in (heading, log)]
+    setup = setup_of(changed(t, *every_other))
+    time = setup.chain.node_time
+    found = setup.carried(track, int(np.searchsorted(time, 131.0)))
+    known = time[: len(found)] <= problem.chain.node_time[-1]
+    assert 0 < known.sum() < len(found)
+    whole = setup_of(t).chain.node_time
+    there = np.searchsorted(whole, time[: len(found)])
+    np.testing.assert_allclose(found[known], x[there[known]], atol=1e-9)
+    off = found[~known] - x[there[~known]]
+    assert np.abs(off[:, :2]).max() < 2.0
+    assert np.abs(off[:, 2:]).max() < 0.3
+    cut = setup_of(t).carried(track, 40)
+    np.testing.assert_allclose(cut, x[:40], atol=1e-9)
 
 
 def test_clocks_that_do_not_fit_are_refused():
