@@ -10,7 +10,7 @@ the motion allows take it down.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import factorial
 
 import numpy as np
@@ -20,10 +20,10 @@ from factorgraph_dvl.geometry.local_cubics import SHORT, filter_matrix, filtered
 from factorgraph_dvl.geometry.vectors import Array
 
 # Half-widths that are tried, samples, the longest of them, s, and the order of the polynomials in
-# them. Chosen: each is half as wide again as the one before; cubics follow a sway of 1 Hz for so
-# long.
-_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
-_LONGEST = 0.25
+# them. Chosen: each is half as wide again as the one before; in a calm sea cubics follow a turn
+# for so long.
+_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25, 38, 57, 85)
+_LONGEST = 1.0
 # The narrowest window.
 _NARROW = 2 * _HALF_WIDTHS[0] + 1
 # Measurements over which an error by sway adds up, while noise averages out, and samples of a
@@ -72,6 +72,32 @@ class Smoothed:
         value = np.asarray(self.spline(time))
         misfit = np.zeros_like(value) if self.misfit is None else np.abs(self.misfit(time))
         return value, np.asarray(self.spline(time, 1)), np.asarray(misfit)
+
+    @cached_property
+    def integral(self) -> BSpline | None:
+        """Integral of the value over time, None where the samples are left alone."""
+        return None if self.spline is None else self.spline.antiderivative()
+
+    def of_means(self, lengths: Array, dt: float) -> tuple[Array, Array]:
+        """Return the standard deviations of means of the value and of their derivatives by time.
+
+        Parameters
+        ----------
+        lengths : ndarray, shape (M,)
+            Intervals of samples that each mean is over.
+        dt : float
+            Interval of the samples, s.
+        """
+        lag, kept, once, twice = _lags(self.window)
+        # Within one interval there is nothing to average.
+        lengths = np.maximum(lengths, 1.0)
+        raw = self.sigma / white_gain(self.window)
+        whole = lengths * np.interp(lengths, lag, once) - np.interp(lengths, lag, twice)
+        change = kept[0] - np.interp(lengths, lag, kept)
+        return (
+            raw * np.sqrt(2.0 * whole) / lengths,
+            raw * np.sqrt(2.0 * change) / (lengths * dt),
+        )
 
     def on_knots_of(self, other: Smoothed) -> Smoothed:
         """Return this signal on the knots of another one at the same times, which are then one."""
@@ -221,6 +247,25 @@ def white_gain(width: int, deriv: int = 0) -> float:
     In its middle value, or in a derivative there, at unit intervals.
     """
     return float(np.linalg.norm(polynomial(width)[deriv]) * factorial(deriv))
+
+
+@lru_cache(maxsize=64)
+def _lags(width: int) -> tuple[Array, Array, Array, Array]:
+    """Return lags, the covariance that a window gives unit noise, and its integrals to each lag.
+
+    With the covariance c(s), those of c and of s c: the variance of a mean over L is
+    2 / L² times the integral of (L - s) c(s).
+    """
+    weights = polynomial(width)[0]
+    whole = np.append(np.correlate(weights, weights, "full")[width - 1 :], 0.0)
+    lag = np.linspace(0.0, width, 16 * width + 1)
+    kept = np.interp(lag, np.arange(width + 1.0), whole)
+    step = lag[1]
+
+    def integral(values: Array) -> Array:
+        return np.append(0.0, np.cumsum(0.5 * step * (values[1:] + values[:-1])))
+
+    return lag, kept, integral(kept), integral(lag * kept)
 
 
 @lru_cache(maxsize=64)

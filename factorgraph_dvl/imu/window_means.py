@@ -7,7 +7,9 @@ integral of the specific force, in the axes in the middle, the velocity in body 
 
 linear in velocity and gravity there. Its mean over the window, and the derivatives of the mean by
 the time of the middle and by the length, follow from running integrals over the samples: what
-vibrates between two measurements is averaged as the sensor averages it. A mean of velocities in n
+vibrates between two measurements is averaged as the sensor averages it. The mean of the rate is
+that of the rate as it is smoothed, so that a window of any length has no more and no less noise
+than one of length zero but by what it averages. A mean of velocities in n
 is, in the axes in the middle, that of v_b(0) + V(s) + g_b s; by it a lever arm moves from where it
 is at one end to where it is at the other.
 """
@@ -32,6 +34,7 @@ from factorgraph_dvl.geometry.vectors import (
 )
 from factorgraph_dvl.imu.between_samples import Cubics, between_samples, cubics_between
 from factorgraph_dvl.imu.increments import Increments, Partial
+from factorgraph_dvl.imu.interpolation import Smoothed
 from factorgraph_dvl.sensors.protocol import Linearization, MeanMotion, Motion, Window
 
 # Samples whose running integrals are in memory at once. Chosen: some ten megabytes.
@@ -217,9 +220,10 @@ class _Point:
     dV : ndarray, shape (M, 3)
         Integral of the specific force, in the axes at the start.
     integrals : tuple of ndarray
-        Integrals of dRᵀ, of t dRᵀ, of dRᵀ dV and of the rate; of means in n, of dV alone.
-    rate : ndarray, shape (M, 3), rad/s
-        Slope of the integral of the rate.
+        Integrals of dRᵀ, of t dRᵀ and of dRᵀ dV; of means in n, of dV alone.
+    angle, rate : ndarray, shape (M, 3), rad and rad/s
+        Integral of the rate, smoothed where that is, and its slope; of means in n, of the
+        samples.
     signals : Partial
         Signals there.
     """
@@ -228,6 +232,7 @@ class _Point:
     dR: Array
     dV: Array
     integrals: tuple[Array, ...]
+    angle: Array
     rate: Array
     signals: Partial
 
@@ -242,6 +247,8 @@ class _Run:
     dR: Array
     dV: Array
     integrals: tuple[Array, ...]
+    angle: Array
+    rates: Smoothed
     of_body: bool
 
     @classmethod
@@ -256,7 +263,8 @@ class _Run:
         cubics = cubics_between(inc, inside, dt)
         steps = _steps(dR, dV, phi, dv, time, dt, cubics, of_body=of_body)
         sums = tuple(sums_before(each) for each in steps)
-        return cls(inc, begin, time, dR, dV, sums, of_body)
+        rates, _ = inc.smoothed[inc.arc_of[begin]]
+        return cls(inc, begin, time, dR, dV, sums, sums_before(phi), rates, of_body)
 
     def at(self, index: IntArray, since: Array) -> _Point:
         """Return the motion `since` seconds after the start of intervals `index`."""
@@ -264,13 +272,17 @@ class _Run:
         dR, dV = self.dR[k], self.dV[k]
         cubics = cubics_between(self.inc, index, since)
         start = self.time[k]
+        angle, rate = self.angle[k] + part.phi, cubics.rate
+        if self.of_body and self.rates.integral is not None:
+            angle, rate = self.rates.integral(self.inc.start[index] + since), part.omega
         steps = _steps(dR, dV, part.phi, part.dv, start, since, cubics, of_body=self.of_body)
         return _Point(
             start + since,
             dR @ exp_so3(part.phi),
             dV + rotate(dR, part.dv),
             tuple(before[k] + step for before, step in zip(self.integrals, steps, strict=True)),
-            cubics.rate,
+            angle,
+            rate,
             part,
         )
 
@@ -305,7 +317,7 @@ def _steps(
     crossed = cross(phi, dv)
     added = (dv / 2.0 - crossed / 3.0 + cross(phi, crossed) / 8.0) * h[:, :, 0]
     added = added + cubics.velocity
-    return back, moment, rotate(back, dV) + added, phi
+    return back, moment, rotate(back, dV) + added
 
 
 def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> Windows:
@@ -315,7 +327,10 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> W
     here = now.signals.omega
     step = float(np.mean(run.inc.dt))
     mean, change, lengthened = (_in_body if run.of_body else _in_n)(now, ends, length)
-    gyro, accel = (sigma * np.sqrt(step) for sigma in (run.inc.gyro_sigma, run.inc.accel_sigma))
+    gyro = run.inc.gyro_sigma * np.sqrt(step / length)
+    slope = np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length
+    if run.of_body and run.rates.integral is not None:
+        gyro, slope = run.rates.of_means(length / step, step)
     return Windows(
         mean,
         change.plus(lengthened.times(growth), 1.0).over(length),
@@ -326,9 +341,9 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> W
             now.signals.force,
             now.signals.alpha,
         ),
-        gyro / np.sqrt(length),
-        np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length,
-        accel / np.sqrt(length),
+        gyro,
+        slope,
+        run.inc.accel_sigma * np.sqrt(step / length),
     )
 
 
@@ -338,7 +353,7 @@ def _in_body(
     """Return the mean in body axes, and its derivatives by time and length, times the length."""
     one, other = ends
     here = now.signals.omega
-    back, moment, moved, angle = (
+    back, moment, moved = (
         _per_second(b - a, length) for a, b in zip(one.integrals, other.integrals, strict=True)
     )
     # By the axes and the time in the middle what is by those at the start of the run.
@@ -347,7 +362,7 @@ def _in_body(
         back @ now.dR,
         about @ now.dR,
         moved - rotate(back, now.dV),
-        angle - here,
+        _per_second(other.angle - one.angle, length) - here,
     )
 
     def at_end(end: _Point, sign: float) -> BodyMotion:

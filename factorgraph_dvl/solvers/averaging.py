@@ -34,8 +34,8 @@ _SHARE = 0.5
 _CERTAIN = 3.0
 
 
-def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
-    """Return lengths of windows, or delays, that the data contradict.
+def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
+    """Return lengths of windows, or delays, that the data contradict: about what they are, s.
 
     Of those that are taken as known. None where another parameter of the sensor that is taken as
     known, as its clock, explains more, or where most of a misfit is left: then the cause is
@@ -51,7 +51,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         for p in problem.all_parameters
         if not (p.estimated or p.spec.plausible is None or p.spec.of_record)
     }
-    out: dict[str, Parameter] = {}
+    out: dict[str, Array] = {}
     for bound, residual in zip(problem.bound, minimum.evaluation.residuals, strict=True):
         observation = bound.observation
         own = {name: known[name] for name in parameters_of(observation) if name in known}
@@ -72,8 +72,9 @@ def shown_windows(problem: Problem, minimum: Minimum) -> tuple[Parameter, ...]:
         # One-sided: lengths are above zero.
         shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
         if found[cause] > shown * scatter and explains:
-            out[cause] = known[cause]
-    return tuple(out.values())
+            step = tests.test([cause]).step
+            out[cause] = np.sqrt(step) if cause == _length(bound) else known[cause].mean + step
+    return out
 
 
 def _misfit(bound: BoundObservation, residual: Array) -> float:

@@ -201,8 +201,8 @@ class Averaging:
         found = shown_windows(at.problem, at.minimum)
         if not found:
             return
-        # From a length of zero, so that all measurements count as before.
-        yield Proposal(_with_others(at, *(wide(p, p.mean) for p in found)), at.states, at.values)
+        freed = (wide(p, p.mean) for p in model.parameters if p.name in found)
+        yield Proposal(_with_others(at, *freed), at.states, {**at.values, **found})
 
 
 class GrossErrors:

@@ -19,7 +19,8 @@ def noise(sigma):
 def test_the_more_motion_the_narrower_the_window():
     white = noise(1e-3)
     slow, fast = (np.sin(2 * np.pi * f * TIME)[:, None] * np.ones(3) + white for f in (0.2, 4.0))
-    assert best_window(white, DT, 1e-3) == 51
+    # Half of the widest is within a second.
+    assert best_window(white, DT, 1e-3) == 171
     assert best_window(white, DT, 1e-3) >= best_window(slow, DT, 1e-3)
     assert best_window(slow, DT, 1e-3) > best_window(fast, DT, 1e-3)
     assert best_window(fast - white, DT, 1e-9) == 0
@@ -82,6 +83,24 @@ def test_the_noise_that_is_left_is_as_stated():
     assert np.std(value) == pytest.approx(found.sigma, rel=0.25)
     assert np.std(slope) == pytest.approx(found.slope_sigma, rel=0.25)
     assert found.sigma < 0.25e-3
+
+
+@pytest.mark.parametrize("length", [0.004, 0.05, 0.305, 1.0, 3.0])
+def test_the_noise_of_means_is_as_stated(length):
+    """Of means over windows and of their slopes; over none, that of the value."""
+    time = np.arange(0.0, 400.0, DT)
+    white = np.random.default_rng(3).normal(0.0, 1e-3, (time.size, 3))
+    found = smooth(time, white, DT, 1e-3, averaged=False, window=51)
+    at = np.arange(3.0, 397.0, 0.1)
+    before, after = at - 0.5 * length, at + 0.5 * length
+    means = (found.integral(after) - found.integral(before)) / length
+    slopes = (found.spline(after) - found.spline(before)) / length
+    sigma, slope_sigma = found.of_means(np.array([length / DT]), DT)
+    assert np.std(means) == pytest.approx(sigma[0], rel=0.05)
+    if length > DT:
+        assert np.std(slopes) == pytest.approx(slope_sigma[0], rel=0.05)
+    else:
+        assert sigma[0] == pytest.approx(found.sigma, rel=0.01)
 
 
 def test_a_step_is_named_as_not_resolved():
