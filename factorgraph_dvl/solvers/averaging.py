@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtri
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.clocks import parameters_of
-from factorgraph_dvl.graph.observation_rows import ObservationRows
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
-from factorgraph_dvl.solvers.record_scores import record_scores
+from factorgraph_dvl.solvers.record_scores import by_square, record_scores, window_part
 from factorgraph_dvl.statistics.scores import Scores
 
 # Share of the sensors that neither average nor are late for which a time is tried all the same.
 # Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
 _BY_CHANCE = 0.05
-# Time between the slopes that show a curvature, s. Chosen: no window is shorter.
-_BETWEEN = 0.1
-# Measurements that are tested, and in how many stretches. Chosen: a quarter of a second of work.
-_ENOUGH, _STRETCHES = 10_000, 20
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
 # Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
@@ -60,13 +54,12 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
             continue
         # Nothing is known of them, whatever they are stated to be.
         unknown = {name: np.full(p.mean.size, np.inf) for name, p in own.items()}
-        tests = _scores(problem, bound, minimum, unknown)
+        tests, share = _scores(problem, bound, minimum, unknown)
         found = {name: tests.test([name]).chi2 for name in own}
         # A clock and a delay beside it do the same to a record: the clock is what is stated.
         cause = max(own, key=lambda name: (found[name], known[name].spec.usual))
         if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
             continue
-        share = len(residual) / _some_of(len(residual)).size
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
         explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
         # One-sided: lengths are above zero.
@@ -90,15 +83,6 @@ def _misfit(bound: BoundObservation, residual: Array) -> float:
     beyond = float(np.sum(own**2 - noise))
     chance = float(np.sqrt(2.0 * np.sum(noise**2) * len(own)))
     return beyond if beyond > _CERTAIN * chance else 0.0
-
-
-def _some_of(count: int) -> IntArray:
-    """Return which of so many measurements are tested: of many, some stretches."""
-    if count <= _ENOUGH:
-        return np.arange(count)
-    length = _ENOUGH // _STRETCHES
-    first = np.linspace(0, count - length, _STRETCHES).astype(int)
-    return (first[:, None] + np.arange(length)).ravel()
 
 
 def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Finding, ...]:
@@ -130,43 +114,15 @@ def _length(bound: BoundObservation) -> str:
 
 def _scores(
     problem: Problem, bound: BoundObservation, minimum: Minimum, known: Mapping[str, Array]
-) -> Scores:
+) -> tuple[Scores, float]:
     """Return the scores of known parameters, the length of the window among them, of a record.
 
-    Of many measurements, some. The square of the length stands in its place: it has a slope at 0.
+    Of many measurements, some, with how many each stands for. The square of the length stands in
+    its place: it has a slope at 0.
     """
     evaluation = minimum.evaluation
-    some = _some_of(bound.observation.time.size)
-    part = replace(
-        bound,
-        observation=ObservationRows(bound.observation, some),
-        attachment=None,
-        usable=bound.usable[some],
-        weight=bound.weight[some],
-    )
-    part.attach(evaluation.parameters)
+    part, share = window_part(problem, bound, evaluation)
     information = minimum.square_root or factorized(problem, evaluation)[0]
     length = _length(bound)
     squares = {length: by_square(problem, part, evaluation)} if length in known else {}
-    return record_scores(problem, part, evaluation, information, known, derivatives=squares)
-
-
-def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
-    """Return derivatives (M, d, 1) of measurements by the square of the length of a window, 1/s².
-
-    Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt². The slope
-    of ρ at both ends of a short window is that by a clock.
-    """
-    values, chain, clock = evaluation.parameters, bound.chain, bound.observation.clock
-    assert clock is not None
-    offset, time = clock.names[0], bound.times(values)
-    slopes, covered = [], np.ones(time.size, dtype=bool)
-    for sign in (-0.5, 0.5):
-        when = time + sign * _BETWEEN
-        motion = bound.motion(chain.attach(when, chain.shift(values)), evaluation.states, values)
-        lin = bound.linearized(motion, values, [offset], problem.processes_of(bound))
-        slopes.append(-lin.d_parameters[offset])
-        covered &= chain.covers(when)
-    out = (slopes[1] - slopes[0]) / (24.0 * _BETWEEN)
-    out[~covered] = 0.0
-    return out
+    return record_scores(problem, part, evaluation, information, known, derivatives=squares), share

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from factorgraph_dvl.geometry.deflection import deflection_along
 from factorgraph_dvl.geometry.units import ARCSEC, STANDARD_GRAVITY
@@ -20,6 +21,7 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
+from factorgraph_dvl.solvers.record_scores import by_square, record_sums, window_part
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -69,7 +71,46 @@ def considered_errors(
         by_key = information.covariance_with([sums])
         changes = {key: -change for key, change in by_key.items()}
         out.append(ConsideredError(cause, assumed, changes))
-    return tuple(out)
+    return (*out, *_by_windows(problem, evaluation, information))
+
+
+def _by_windows(
+    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+) -> Iterator[ConsideredError]:
+    """Yield the windows over which sensors may average, and that are not estimated.
+
+    What the data and a plausible length together leave of the square of the length m has the
+    density of a normal distribution above zero. Its root mean square is considered.
+    """
+    known = {p.name: p for p in problem.all_parameters if p.spec.usual and not p.estimated}
+    for bound in problem.bound:
+        p = known.get(bound.observation.averaging or "")
+        if p is None or p.spec.plausible is None or problem.chain.interpolates:
+            continue
+        if p.mean.any() or not bound.weight.any():
+            continue
+        part, share = window_part(problem, bound, evaluation)
+        squares = {p.name: by_square(problem, part, evaluation)}
+        sums = record_sums(problem, part, evaluation, {p.name: np.full(1, np.inf)}, None, squares)
+        moved = information.covariance_with([sums.by_key])
+        taken_up = sum(float((sums.by_key[key] @ moved[key])[0, 0]) for key in sums.by_key)
+        # By all measurements. What is eliminated takes up as much of each.
+        precision = share * (float(sums.square[0, 0]) - share * taken_up)
+        precision = max(precision, 0.0) + p.spec.plausible**-4.0
+        size = _root_mean_square(share * float(sums.score[0]) / precision, precision**-0.5)
+        changes = {key: -share * size * change for key, change in moved.items()}
+        label = bound.observation.label
+        yield ConsideredError(
+            f"averaging of {label}", f"up to {np.sqrt(2.0 * size):.2g} s", changes
+        )
+
+
+def _root_mean_square(mean: float, sigma: float) -> float:
+    """Return that of what has a normal distribution but is above zero."""
+    a = mean / sigma
+    # Of the density at zero over the probability above it.
+    ratio = np.exp(-0.5 * a**2 - log_ndtr(a)) / np.sqrt(2.0 * np.pi)
+    return sigma * float(np.sqrt(max(1.0 + a**2 + a * ratio, 0.0)))
 
 
 def _by_offsets(

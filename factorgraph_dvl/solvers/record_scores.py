@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.statistics.rows import add_transposed_product
@@ -18,6 +20,31 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 
 # Measurements whose derivatives are there at once. Chosen: some ten megabytes.
 _CHUNK = 4096
+# Measurements that show a window, and in how many stretches. Chosen: a quarter of a second.
+_ENOUGH, _STRETCHES = 10_000, 20
+# Time between the slopes that show a curvature, s. Chosen: no window is shorter.
+_BETWEEN = 0.1
+
+
+@dataclass(frozen=True)
+class RecordSums:
+    """What the rows of a record say of parameters that change it alone, nothing eliminated.
+
+    With J the whitened derivatives by C components, A those by all variables, r the residuals.
+
+    Parameters
+    ----------
+    score : ndarray, shape (C,)
+        -Jᵀ r.
+    square : ndarray, shape (C, C)
+        JᵀJ.
+    by_key : dict of int to ndarray
+        JᵀA, (C, size) by key.
+    """
+
+    score: Array
+    square: Array
+    by_key: dict[int, Array]
 
 
 def record_scores(
@@ -55,6 +82,22 @@ def record_scores(
     derivatives : mapping of str to ndarray, optional
         Derivatives (M, d, n) by some of the parameters, in place of those of the observation.
     """
+    sums = record_sums(problem, bound, evaluation, candidates, motion, derivatives)
+    square = sums.square - information.covariance_of([sums.by_key])
+    edges = np.cumsum([0, *(sigma.size for sigma in candidates.values())]).tolist()
+    places = {name: slice(*ends) for name, ends in zip(candidates, pairwise(edges), strict=True)}
+    return Scores(places, sums.score, square, np.concatenate(list(candidates.values())))
+
+
+def record_sums(
+    problem: Problem,
+    bound: BoundObservation,
+    evaluation: Evaluation,
+    candidates: Mapping[str, Array],
+    motion: Motion | None = None,
+    derivatives: Mapping[str, Array] = MappingProxyType({}),
+) -> RecordSums:
+    """Return what the rows of a record say of parameters; arguments as of `record_scores`."""
     values = evaluation.parameters
     if motion is None:
         motion = bound.motion(bound.attachment, evaluation.states, values)
@@ -80,6 +123,46 @@ def record_scores(
         flat = by_names.reshape(-1, edges[-1])
         score -= flat.T @ residual.ravel()
         square += flat.T @ flat
-    square -= information.covariance_of([taken_up])
-    places = {name: slice(*ends) for name, ends in zip(candidates, pairwise(edges), strict=True)}
-    return Scores(places, score, square, np.concatenate(list(candidates.values())))
+    return RecordSums(score, square, taken_up)
+
+
+def window_part(
+    problem: Problem, bound: BoundObservation, evaluation: Evaluation
+) -> tuple[BoundObservation, float]:
+    """Return measurements of an observation that show its window, and how many each stands for."""
+    count = bound.observation.time.size
+    some: IntArray = np.arange(count)
+    if count > _ENOUGH:
+        length = _ENOUGH // _STRETCHES
+        first = np.linspace(0, count - length, _STRETCHES).astype(int)
+        some = (first[:, None] + np.arange(length)).ravel()
+    part = replace(
+        bound,
+        observation=ObservationRows(bound.observation, some),
+        attachment=None,
+        usable=bound.usable[some],
+        weight=bound.weight[some],
+    )
+    part.attach(evaluation.parameters)
+    return part, count / some.size
+
+
+def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
+    """Return derivatives (M, d, 1) of measurements by the square of the length of a window, 1/s².
+
+    Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt². The slope
+    of ρ at both ends of a short window is that by a clock.
+    """
+    values, chain, clock = evaluation.parameters, bound.chain, bound.observation.clock
+    assert clock is not None
+    offset, time = clock.names[0], bound.times(values)
+    slopes, covered = [], np.ones(time.size, dtype=bool)
+    for sign in (-0.5, 0.5):
+        when = time + sign * _BETWEEN
+        motion = bound.motion(chain.attach(when, chain.shift(values)), evaluation.states, values)
+        lin = bound.linearized(motion, values, [offset], problem.processes_of(bound))
+        slopes.append(-lin.d_parameters[offset])
+        covered &= chain.covers(when)
+    out = (slopes[1] - slopes[0]) / (24.0 * _BETWEEN)
+    out[~covered] = 0.0
+    return out

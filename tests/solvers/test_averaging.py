@@ -16,8 +16,8 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
-from factorgraph_dvl.solvers.averaging import by_square
 from factorgraph_dvl.solvers.batch import solve, solved_problems
+from factorgraph_dvl.solvers.record_scores import by_square
 
 MOUNT = (
     *(f"misalignment_{axis}_deg" for axis in "xyz"),
