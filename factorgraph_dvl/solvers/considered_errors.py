@@ -21,7 +21,7 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
-from factorgraph_dvl.solvers.record_scores import by_square, record_sums, window_part
+from factorgraph_dvl.solvers.record_scores import by_square, record_sums
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -82,27 +82,29 @@ def _by_windows(
     What the data and a plausible length together leave of the square of the length m has the
     density of a normal distribution above zero. Its root mean square is considered.
     """
-    known = {p.name: p for p in problem.all_parameters if p.spec.usual and not p.estimated}
+    usual = {p.name: p for p in problem.all_parameters if p.spec.usual and not p.estimated}
     for bound in problem.bound:
-        p = known.get(bound.observation.averaging or "")
+        p = usual.get(bound.observation.averaging or "")
         if p is None or p.spec.plausible is None or problem.chain.interpolates:
             continue
         if p.mean.any() or not bound.weight.any():
             continue
-        part, share = window_part(problem, bound, evaluation)
-        squares = {p.name: by_square(problem, part, evaluation)}
-        sums = record_sums(problem, part, evaluation, {p.name: np.full(1, np.inf)}, None, squares)
+        squares = {p.name: by_square(problem, bound, evaluation)}
+        wide = {p.name: np.full(1, np.inf)}
+        sums = record_sums(problem, bound, evaluation, wide, None, squares)
         moved = information.covariance_with([sums.by_key])
-        taken_up = sum(float((sums.by_key[key] @ moved[key])[0, 0]) for key in sums.by_key)
-        # By all measurements. What is eliminated takes up as much of each.
-        precision = share * (float(sums.square[0, 0]) - share * taken_up)
-        precision = max(precision, 0.0) + p.spec.plausible**-4.0
-        size = _root_mean_square(share * float(sums.score[0]) / precision, precision**-0.5)
-        changes = {key: -share * size * change for key, change in moved.items()}
-        label = bound.observation.label
-        yield ConsideredError(
-            f"averaging of {label}", f"up to {np.sqrt(2.0 * size):.2g} s", changes
+        taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in sums.by_key.items())
+        known = max(float(sums.square[0, 0]) - taken_up, 0.0)
+        # Means over windows that share pings are rare.
+        longest = min(
+            p.spec.plausible, float(np.median(np.diff(np.unique(bound.observation.time))))
         )
+        precision = known + longest**-4.0
+        size = _root_mean_square(float(sums.score[0]) / precision, precision**-0.5)
+        changes = {key: -size * change for key, change in moved.items()}
+        label = bound.observation.label
+        upto = f"up to {np.sqrt(2.0 * size):.2g} s"
+        yield ConsideredError(f"averaging of {label}", upto, changes)
 
 
 def _root_mean_square(mean: float, sigma: float) -> float:
