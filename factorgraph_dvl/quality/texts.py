@@ -22,6 +22,7 @@ _CAUSES = {
     "correlated noise of ": "相关噪声",
     "lasting errors of ": "的持续误差",
     "slow errors of ": "的慢变误差",
+    "averaging of ": "的平均窗口",
     "prior of ": "的先验",
     "random walk of ": "的随机游走",
 }

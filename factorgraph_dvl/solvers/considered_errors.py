@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from factorgraph_dvl.geometry.deflection import deflection_along
 from factorgraph_dvl.geometry.units import ARCSEC, STANDARD_GRAVITY
@@ -27,6 +26,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 
 # IMU factors that are read at once. Chosen: some ten megabytes.
 _CHUNK = 4096
+# Lengths of windows over plausible ones, over which is integrated. Chosen: to four digits.
+_LENGTHS = np.concatenate([[0.0], np.geomspace(1e-4, 5.0, 4000)])
 
 
 @dataclass(frozen=True)
@@ -79,8 +80,7 @@ def _by_windows(
 ) -> Iterator[ConsideredError]:
     """Yield the windows over which sensors may average, and that are not estimated.
 
-    What the data and a plausible length together leave of the square of the length m has the
-    density of a normal distribution above zero. Its root mean square is considered.
+    The root mean square of the square of the length is considered, by what the data say of it.
     """
     usual = {p.name: p for p in problem.all_parameters if p.spec.usual and not p.estimated}
     for bound in problem.bound:
@@ -96,23 +96,34 @@ def _by_windows(
         taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in sums.by_key.items())
         known = max(float(sums.square[0, 0]) - taken_up, 0.0)
         # Means over windows that share pings are rare.
-        longest = min(
-            p.spec.plausible, float(np.median(np.diff(np.unique(bound.observation.time))))
-        )
-        precision = known + longest**-4.0
-        size = _root_mean_square(float(sums.score[0]) / precision, precision**-0.5)
+        between = float(np.median(np.diff(np.unique(bound.observation.time))))
+        size = likely_square(float(sums.score[0]), known, min(p.spec.plausible, between))
         changes = {key: -size * change for key, change in moved.items()}
         label = bound.observation.label
         upto = f"up to {np.sqrt(2.0 * size):.2g} s"
         yield ConsideredError(f"averaging of {label}", upto, changes)
 
 
-def _root_mean_square(mean: float, sigma: float) -> float:
-    """Return that of what has a normal distribution but is above zero."""
-    a = mean / sigma
-    # Of the density at zero over the probability above it.
-    ratio = np.exp(-0.5 * a**2 - log_ndtr(a)) / np.sqrt(2.0 * np.pi)
-    return sigma * float(np.sqrt(max(1.0 + a**2 + a * ratio, 0.0)))
+def likely_square(score: float, information: float, plausible: float) -> float:
+    """Return the root mean square, s², of the square m of the length of a window.
+
+    As probable as not, a sensor measures in no time. Else its window has a normal distribution
+    above zero. The data change both by the likelihood of m, exp(score m - information m² / 2).
+
+    Parameters
+    ----------
+    score, information : float
+        Slope of the log likelihood by m at zero, 1/s², and its information, 1/s⁴.
+    plausible : float
+        Standard deviation of the normal distribution, s.
+    """
+    length = plausible * _LENGTHS
+    m = length**2
+    exponent = score * m - 0.5 * information * m**2 - 0.5 * _LENGTHS**2
+    highest = max(float(exponent.max()), 0.0)
+    density = np.sqrt(2.0 / np.pi) * np.exp(exponent - highest)
+    averages = float(np.trapezoid(density, _LENGTHS))
+    return float(np.sqrt(np.trapezoid(density * m**2, _LENGTHS) / (averages + np.exp(-highest))))
 
 
 def _by_offsets(

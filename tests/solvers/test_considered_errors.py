@@ -14,7 +14,7 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajec
 from factorgraph_dvl.geometry.units import ARCSEC
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
-from factorgraph_dvl.solvers.considered_errors import considered_errors
+from factorgraph_dvl.solvers.considered_errors import considered_errors, likely_square
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.posterior import of_states
@@ -82,7 +82,7 @@ def test_what_residuals_do_not_show_of_positions_moves_the_trajectory_and_nothin
     problem.noise_factors = {"GNSS position": np.array([0.6, 0.6, 1.0])}
     problem.weigh(evaluation)
     minimum = minimise(problem, evaluation.values, stage="as weighed", weighed=True)
-    (error,) = considered_errors(problem, minimum.evaluation, minimum.information)
+    error, *_ = considered_errors(problem, minimum.evaluation, minimum.information)
     assert error.cause == "slow errors of GNSS position"
     change = of_states(problem.chain, error.changes)
     moved = minimum.evaluation.states.nRb @ change[:, 3:6]
@@ -118,3 +118,40 @@ def test_positions_hold_their_standard_deviations_under_slow_errors(tau):
     assert np.mean(nees) < 2.0, np.round(nees, 2)
     assert np.mean(inside, axis=0).min() > 0.9, np.round(inside, 2)
     assert np.sqrt(np.mean(squares)) > 0.6, np.round(squares, 2)
+
+
+def test_what_may_be_averaged_is_considered_until_it_is_stated():
+    """The change is that of a window whose length is known, from the same minimum."""
+    plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    for axis in ("roll", "pitch"):
+        plan["sway"][axis][0]["frequency_hz"] = 0.3
+    found = solved_problems(simulate(parse_scenario(plan), 1))[0]
+    (error,) = (e for e in found.covariances.errors if e.cause == "averaging of DVL velocity")
+    longest = float(error.assumed.removeprefix("up to ").removesuffix(" s"))
+    assert 0.02 < longest < 0.2
+    lengths = 0.05, 0.1
+    ends = []
+    for length in lengths:
+        plan["trial"]["dvl"] |= {"averaging_s": length, "averaging_std_s": 0.0}
+        stated = solved_problems(simulate(parse_scenario(plan), 1))[0]
+        ends.append(stated.minimum.evaluation.parameters["lever_arm_m"])
+    # Half of the square of the longest is considered.
+    share = (lengths[1] ** 2 - lengths[0] ** 2) / (0.5 * longest**2)
+    change = share * error.changes[found.problem.key("lever_arm_m")][:, 0]
+    assert np.abs(change).max() > 2e-3
+    np.testing.assert_allclose(ends[1] - ends[0], change, atol=0.15 * np.abs(change).max())
+    assert not any("DVL" in e.cause for e in stated.covariances.errors)
+
+
+def test_how_long_a_window_may_be():
+    # Nothing is known: half of 3 L⁴, the fourth moment of a normal distribution.
+    assert likely_square(0.0, 0.0, 0.3) == pytest.approx(0.09 * np.sqrt(1.5), rel=1e-4)
+    # Well known: what is found, or nothing.
+    assert likely_square(0.04 * 1e8, 1e8, 0.3) == pytest.approx(0.04, rel=1e-3)
+    assert likely_square(-0.04 * 1e6, 1e6, 0.3) < 1e-5
+    # Around zero the density by the square is m^(-1/2): by hand, with a precision of 1 / s⁴ and a
+    # window that is plausible without limit, all that averages has half of 1 / precision.
+    precision, wide = 1e10, 10.0
+    within = np.sqrt(2.0 / np.pi) / wide * precision**-0.25 * 0.5 * 2.0**-0.75 * 3.6256
+    expected = within * 0.5 / precision
+    assert likely_square(0.0, precision, wide) ** 2 == pytest.approx(expected, rel=0.01)
