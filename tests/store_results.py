@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from windows import with_no_window
 
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -32,7 +33,7 @@ def results(name: str) -> dict[str, Any]:
         if "repeat" in manoeuvre:
             manoeuvre["repeat"] = 1
     # Estimated noise would move all numbers by a part of what chance moves it.
-    trial = replace(simulate(parse_scenario(data), seed=1), noise="stated")
+    trial = with_no_window(replace(simulate(parse_scenario(data), seed=1), noise="stated"))
     solution = solve(trial, rate_hz=1.0)
     motion = solution.trajectory
     rows = np.linspace(0, motion.time.size - 1, 5).astype(int)

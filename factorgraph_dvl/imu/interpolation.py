@@ -20,10 +20,10 @@ from factorgraph_dvl.geometry.local_cubics import SHORT, filter_matrix, filtered
 from factorgraph_dvl.geometry.vectors import Array
 
 # Half-widths that are tried, samples, the longest of them, s, and the order of the polynomials in
-# them. Chosen: each is half as wide again as the one before; in a calm sea cubics follow a turn
-# for so long.
-_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25, 38, 57, 85)
-_LONGEST = 1.0
+# them. Chosen: each is half as wide again as the one before; cubics follow a sway of 1 Hz for so
+# long.
+_HALF_WIDTHS = (2, 3, 5, 8, 12, 18, 25)
+_LONGEST = 0.25
 # The narrowest window.
 _NARROW = 2 * _HALF_WIDTHS[0] + 1
 # Measurements over which an error by sway adds up, while noise averages out, and samples of a

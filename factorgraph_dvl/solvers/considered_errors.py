@@ -96,8 +96,9 @@ def _by_windows(
         taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in sums.by_key.items())
         known = max(float(sums.square[0, 0]) - taken_up, 0.0)
         # Means over windows that share pings are rare.
-        between = float(np.median(np.diff(np.unique(bound.observation.time))))
-        size = likely_square(float(sums.score[0]), known, min(p.spec.plausible, between))
+        between = np.diff(np.unique(bound.observation.time))
+        longest = min(p.spec.plausible, float(np.median(between)) if between.size else np.inf)
+        size = likely_square(float(sums.score[0]), known, longest)
         changes = {key: -size * change for key, change in moved.items()}
         label = bound.observation.label
         upto = f"up to {np.sqrt(2.0 * size):.2g} s"

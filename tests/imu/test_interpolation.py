@@ -19,8 +19,7 @@ def noise(sigma):
 def test_the_more_motion_the_narrower_the_window():
     white = noise(1e-3)
     slow, fast = (np.sin(2 * np.pi * f * TIME)[:, None] * np.ones(3) + white for f in (0.2, 4.0))
-    # Half of the widest is within a second.
-    assert best_window(white, DT, 1e-3) == 171
+    assert best_window(white, DT, 1e-3) == 51
     assert best_window(white, DT, 1e-3) >= best_window(slow, DT, 1e-3)
     assert best_window(slow, DT, 1e-3) > best_window(fast, DT, 1e-3)
     assert best_window(fast - white, DT, 1e-9) == 0

@@ -10,6 +10,7 @@ from findings import of_code
 from scipy.spatial.transform import Rotation
 from stated_noise import stated
 from truth import CORRELATED, config
+from windows import with_no_window
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors
 from factorgraph_dvl.graph.processes import walk_sigma, walk_time
@@ -50,8 +51,8 @@ MOUNTED = {
 
 def as_the_batch(trial, rate=1.0):
     """Replay a trial, and hold its end against the batch solver and its way against the truth."""
-    # What a replay finds of the noise is of its first minute only.
-    trial = replace(trial, noise="stated")
+    # What a replay finds of the noise is of its first minute only, and it considers no window.
+    trial = with_no_window(replace(trial, noise="stated"))
     solution, _ = replay(trial, rate_hz=rate)
     batch = solve(trial)
     assert solution.order == batch.order
