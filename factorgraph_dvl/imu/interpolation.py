@@ -78,27 +78,6 @@ class Smoothed:
         """Integral of the value over time, None where the samples are left alone."""
         return None if self.spline is None else self.spline.antiderivative()
 
-    def of_means(self, lengths: Array, dt: float) -> tuple[Array, Array]:
-        """Return the standard deviations of means of the value and of their derivatives by time.
-
-        Parameters
-        ----------
-        lengths : ndarray, shape (M,)
-            Intervals of samples that each mean is over.
-        dt : float
-            Interval of the samples, s.
-        """
-        lag, kept, once, twice = _lags(self.window)
-        # Within one interval there is nothing to average.
-        lengths = np.maximum(lengths, 1.0)
-        raw = self.sigma / white_gain(self.window)
-        whole = lengths * np.interp(lengths, lag, once) - np.interp(lengths, lag, twice)
-        change = kept[0] - np.interp(lengths, lag, kept)
-        return (
-            raw * np.sqrt(2.0 * whole) / lengths,
-            raw * np.sqrt(2.0 * change) / (lengths * dt),
-        )
-
     def on_knots_of(self, other: Smoothed) -> Smoothed:
         """Return this signal on the knots of another one at the same times, which are then one."""
         if self.spline is None or other.spline is None:
@@ -249,23 +228,62 @@ def white_gain(width: int, deriv: int = 0) -> float:
     return float(np.linalg.norm(polynomial(width)[deriv]) * factorial(deriv))
 
 
-@lru_cache(maxsize=64)
-def _lags(width: int) -> tuple[Array, Array, Array, Array]:
-    """Return lags, the covariance that a window gives unit noise, and its integrals to each lag.
+def smoothed_share(width: int, lengths: Array) -> tuple[Array, Array, Array]:
+    """Return the share of the smoothed signal in means that have the noise of one of its values.
 
-    With the covariance c(s), those of c and of s c: the variance of a mean over L is
-    2 / L² times the integral of (L - s) c(s).
+    The rest is the mean of the samples: alone, it has less noise from some length on.
+
+    Parameters
+    ----------
+    width : int
+        Window of the smoothing, samples.
+    lengths : ndarray, shape (M,)
+        Intervals of samples that each mean is over.
+
+    Returns
+    -------
+    share, slope : ndarray, shape (M,)
+        Share, and its derivative by the length.
+    sigma : ndarray, shape (M,)
+        Standard deviation of the mean where that of a sample is one.
     """
-    weights = polynomial(width)[0]
-    whole = np.append(np.correlate(weights, weights, "full")[width - 1 :], 0.0)
-    lag = np.linspace(0.0, width, 16 * width + 1)
-    kept = np.interp(lag, np.arange(width + 1.0), whole)
-    step = lag[1]
+    length, share, slope = _shares(width)
+    sigma = np.minimum(white_gain(width), np.maximum(lengths, 1.0) ** -0.5)
+    return np.interp(lengths, length, share), np.interp(lengths, length, slope), sigma
 
-    def integral(values: Array) -> Array:
-        return np.append(0.0, np.cumsum(0.5 * step * (values[1:] + values[:-1])))
 
-    return lag, kept, integral(kept), integral(lag * kept)
+@lru_cache(maxsize=64)
+def _shares(width: int) -> tuple[Array, Array, Array]:
+    """Return lengths of means, the share of the smoothed signal in each, and its slope.
+
+    A mean over L of a signal with the covariance c(s) has the variance 2 / L² times the integral
+    of (L - s) c(s), s from 0 to L. The window's weights are the covariance of samples and smoothed
+    signal.
+    """
+    weights, half = polynomial(width)[0], width // 2
+    lag = np.linspace(0.0, width, 16 * width + 1)[1:]
+    kept = np.append(np.correlate(weights, weights, "full")[width - 1 :], 0.0)
+    smooth, both = (_of_mean(lag, c) for c in (kept, np.append(weights[half:], 0.0)))
+    raw, wanted = 1.0 / np.maximum(lag, 1.0), kept[0]
+    # (1 - a)² raw + 2 a (1 - a) both + a² smooth = wanted, and the least a.
+    square, line = raw - 2.0 * both + smooth, raw - both
+    inside = np.maximum(line**2 - square * (raw - wanted), 0.0)
+    share = np.clip((line - np.sqrt(inside)) / np.maximum(square, 1e-12), 0.0, 1.0)
+    share[raw <= wanted] = 0.0
+    return lag, share, np.gradient(share, lag)
+
+
+def _of_mean(length: Array, covariance: Array) -> Array:
+    """Return the variances of means over lengths, for a covariance at whole lags and 0 beyond."""
+    c = np.interp(length, np.arange(float(covariance.size)), covariance, right=0.0)
+    step = length[1] - length[0]
+
+    def integral(values: Array, first: float) -> Array:
+        before = np.concatenate([[first], values[:-1]])
+        return np.cumsum(0.5 * step * (before + values))
+
+    whole = length * integral(c, covariance[0]) - integral(length * c, 0.0)
+    return np.asarray(2.0 * whole / length**2)
 
 
 @lru_cache(maxsize=64)

@@ -8,10 +8,10 @@ integral of the specific force, in the axes in the middle, the velocity in body 
 linear in velocity and gravity there. Its mean over the window, and the derivatives of the mean by
 the time of the middle and by the length, follow from running integrals over the samples: what
 vibrates between two measurements is averaged as the sensor averages it. The mean of the rate is
-that of the rate as it is smoothed, so that a window of any length has no more and no less noise
-than one of length zero but by what it averages. A mean of velocities in n
-is, in the axes in the middle, that of v_b(0) + V(s) + g_b s; by it a lever arm moves from where it
-is at one end to where it is at the other.
+smoothed by so much that it has the noise of the smoothed rate at one time, as long as it has
+that. Else a longer window would have less noise than a shorter one, and be the better model for
+that alone. A mean of velocities in n is, in the axes in the middle, that of v_b(0) + V(s) + g_b s;
+by it a lever arm moves from where it is at one end to where it is at the other.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from factorgraph_dvl.geometry.vectors import (
 )
 from factorgraph_dvl.imu.between_samples import Cubics, between_samples, cubics_between
 from factorgraph_dvl.imu.increments import Increments, Partial
-from factorgraph_dvl.imu.interpolation import Smoothed
+from factorgraph_dvl.imu.interpolation import Smoothed, smoothed_share
 from factorgraph_dvl.sensors.protocol import Linearization, MeanMotion, Motion, Window
 
 # Samples whose running integrals are in memory at once. Chosen: some ten megabytes.
@@ -222,8 +222,9 @@ class _Point:
     integrals : tuple of ndarray
         Integrals of dRᵀ, of t dRᵀ and of dRᵀ dV; of means in n, of dV alone.
     angle, rate : ndarray, shape (M, 3), rad and rad/s
-        Integral of the rate, smoothed where that is, and its slope; of means in n, of the
-        samples.
+        Integral of the rate of the samples, and its slope.
+    smooth : ndarray, shape (M, 3), rad
+        Integral of the rate as it is smoothed; zero where it is not.
     signals : Partial
         Signals there.
     """
@@ -234,6 +235,7 @@ class _Point:
     integrals: tuple[Array, ...]
     angle: Array
     rate: Array
+    smooth: Array
     signals: Partial
 
 
@@ -272,17 +274,18 @@ class _Run:
         dR, dV = self.dR[k], self.dV[k]
         cubics = cubics_between(self.inc, index, since)
         start = self.time[k]
-        angle, rate = self.angle[k] + part.phi, cubics.rate
+        smooth = np.zeros_like(part.phi)
         if self.of_body and self.rates.integral is not None:
-            angle, rate = self.rates.integral(self.inc.start[index] + since), part.omega
+            smooth = self.rates.integral(self.inc.start[index] + since)
         steps = _steps(dR, dV, part.phi, part.dv, start, since, cubics, of_body=self.of_body)
         return _Point(
             start + since,
             dR @ exp_so3(part.phi),
             dV + rotate(dR, part.dv),
             tuple(before[k] + step for before, step in zip(self.integrals, steps, strict=True)),
-            angle,
-            rate,
+            self.angle[k] + part.phi,
+            cubics.rate,
+            smooth,
             part,
         )
 
@@ -328,9 +331,12 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> W
     step = float(np.mean(run.inc.dt))
     mean, change, lengthened = (_in_body if run.of_body else _in_n)(now, ends, length)
     gyro = run.inc.gyro_sigma * np.sqrt(step / length)
-    slope = np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length
     if run.of_body and run.rates.integral is not None:
-        gyro, slope = run.rates.of_means(length / step, step)
+        share, by_length, white = smoothed_share(run.rates.window, length / step)
+        gyro = run.inc.gyro_sigma * white
+        mean, change, lengthened = _smoothed(
+            (mean, change, lengthened), ends, length, share, by_length / step
+        )
     return Windows(
         mean,
         change.plus(lengthened.times(growth), 1.0).over(length),
@@ -342,8 +348,32 @@ def _windows(run: _Run, now: _Point, ends: Sequence[_Point], growth: Array) -> W
             now.signals.alpha,
         ),
         gyro,
-        slope,
+        np.sqrt(2.0) * now.signals.omega_sigma.max(axis=1) / length,
         run.inc.accel_sigma * np.sqrt(step / length),
+    )
+
+
+def _smoothed(
+    bodies: tuple[BodyMotion, BodyMotion, BodyMotion],
+    ends: Sequence[_Point],
+    length: Array,
+    share: Array,
+    by_length: Array,
+) -> tuple[BodyMotion, BodyMotion, BodyMotion]:
+    """Return a mean and its derivatives, times the length, with a share of the smoothed rate.
+
+    The share (M,) has a derivative by the length, 1/s.
+    """
+    mean, change, lengthened = bodies
+    beyond = [end.smooth - end.angle for end in ends]
+    faster = [end.signals.omega - end.rate for end in ends]
+    more, share = _per_second(beyond[1] - beyond[0], length), share[:, None]
+    longer = share * (0.5 * (faster[0] + faster[1]) - more)
+    longer = longer + (by_length * length)[:, None] * more
+    return (
+        replace(mean, rate=mean.rate + share * more),
+        replace(change, rate=change.rate + share * (faster[1] - faster[0])),
+        replace(lengthened, rate=lengthened.rate + longer),
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from factorgraph_dvl.imu import interpolation
-from factorgraph_dvl.imu.interpolation import best_window, smooth, unsmoothed
+from factorgraph_dvl.imu.interpolation import best_window, smooth, smoothed_share, unsmoothed
 
 DT = 0.01
 TIME = np.arange(0.0, 10.0, DT)
@@ -84,22 +84,29 @@ def test_the_noise_that_is_left_is_as_stated():
     assert found.sigma < 0.25e-3
 
 
-@pytest.mark.parametrize("length", [0.004, 0.05, 0.305, 1.0, 3.0])
-def test_the_noise_of_means_is_as_stated(length):
-    """Of means over windows and of their slopes; over none, that of the value."""
+@pytest.mark.parametrize("length", [0.05, 0.1, 0.2, 0.305, 1.0])
+def test_means_have_the_noise_of_one_value(length):
+    """With the share of the smoothed signal; those of many samples have less by themselves."""
     time = np.arange(0.0, 400.0, DT)
     white = np.random.default_rng(3).normal(0.0, 1e-3, (time.size, 3))
     found = smooth(time, white, DT, 1e-3, averaged=False, window=51)
-    at = np.arange(3.0, 397.0, 0.1)
-    before, after = at - 0.5 * length, at + 0.5 * length
-    means = (found.integral(after) - found.integral(before)) / length
-    slopes = (found.spline(after) - found.spline(before)) / length
-    sigma, slope_sigma = found.of_means(np.array([length / DT]), DT)
-    assert np.std(means) == pytest.approx(sigma[0], rel=0.05)
-    if length > DT:
-        assert np.std(slopes) == pytest.approx(slope_sigma[0], rel=0.05)
-    else:
-        assert sigma[0] == pytest.approx(found.sigma, rel=0.01)
+    ends = np.arange(3.0, 397.0, 0.1)[:, None] + 0.5 * length * np.array([-1.0, 1.0])
+    # Samples are values at their times: half of an interval before and after belongs to each.
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(white * DT, axis=0)])
+    edges = np.append(time - 0.5 * DT, time[-1] + 0.5 * DT)
+    angle = np.stack([np.interp(ends, edges, each) for each in total.T], axis=2)
+    raw = (angle[:, 1] - angle[:, 0]) / length
+    smoothed = (found.integral(ends[:, 1]) - found.integral(ends[:, 0])) / length
+    share, slope, sigma = smoothed_share(51, np.array([length / DT]))
+    mean = (1.0 - share) * raw + share * smoothed
+    assert np.std(mean) == pytest.approx(1e-3 * sigma[0], rel=0.05)
+    if length < 0.2:
+        assert sigma[0] * 1e-3 == pytest.approx(found.sigma)
+        assert 0.0 < share[0] < 1.0
+        later = smoothed_share(51, np.array([length / DT + 0.5]))[0]
+        assert slope[0] == pytest.approx(2.0 * (later[0] - share[0]), rel=0.1)
+    if length > 0.3:
+        assert share[0] == 0.0
 
 
 def test_a_step_is_named_as_not_resolved():
