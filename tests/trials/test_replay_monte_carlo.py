@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from truth import CORRELATED, config
+from windows import with_no_window
 from workers import in_two_processes
 
 from factorgraph_dvl.analysis.error_statistics import motion_errors, nees_band, true_value_of
@@ -83,7 +84,9 @@ def scene_of(name):
 def one(job):
     name, seed = job
     first_minutes = name in RATE and not name.endswith(WHOLE)
-    trial = up_to(simulate(scene_of(name), seed), MIX_END if first_minutes else END)
+    trial = with_no_window(
+        up_to(simulate(scene_of(name), seed), MIX_END if first_minutes else END)
+    )
     if name == "correlated noise":
         trial = replace(trial, noise="stated")
     session, updates = Replay(trial, rate_hz=RATE.get(name, 1.0)), []
