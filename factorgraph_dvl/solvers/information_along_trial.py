@@ -231,8 +231,9 @@ def as_history(
         names += parameter.component_names
         free.append(parameter.sigma > 0.0)
         priors.append(parameter.sigma / parameter.si)
-    is_free = np.concatenate(free)
-    transport = np.concatenate(rows)[is_free]
+    # A track may have nothing else to estimate.
+    is_free = np.concatenate([np.zeros(0, dtype=bool), *free])
+    transport = np.concatenate([np.zeros((0, triangles.shape[1])), *rows])[is_free]
     whiten = np.linalg.inv(problem.prior_root)
     of_parameters = slice(triangles.shape[1] - len(whiten), None)
 
@@ -242,7 +243,7 @@ def as_history(
     at_prior = prior(fixed)
     size = int(is_free.sum())
     root = np.empty((triangles.shape[0], size, size))
-    for k, triangle in enumerate(triangles):
+    for k, triangle in enumerate(triangles if size else ()):
         spread = at_prior
         if k in undetermined:
             rows_fixed = np.zeros((undetermined[k].shape[1], triangle.shape[0]))
@@ -253,7 +254,7 @@ def as_history(
         if info != 0:
             raise np.linalg.LinAlgError("a constant without a prior")
         root[k] = _triangle(np.hstack([transport @ inverse, spread]).T, size).T
-    if errors:
+    if errors and kept:
         changes = np.hstack([changes_of(kept, error.changes) for error in errors])[is_free]
         taken = np.concatenate(priors)[is_free] ** 2 - np.sum(root**2, axis=2)
         share = np.clip(taken / np.maximum(taken[-1], np.finfo(float).tiny), 0.0, 1.0)

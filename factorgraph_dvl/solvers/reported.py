@@ -75,6 +75,8 @@ def estimates_of(
     """
     total = sum(value.size for _, value in rows)
     covariance = np.zeros((total, total))
+    if not rows:
+        return (), covariance
     is_free = np.concatenate([np.full(value.size, p.estimated) for p, value in rows])
     covariance[np.ix_(is_free, is_free)] = joint
     exact = np.concatenate([p.sigma == 0.0 for p, _ in rows])

@@ -206,6 +206,8 @@ class SquareRootInformation:
         ndarray, shape (sum n, sum n)
             Covariance.
         """
+        if not functionals:
+            return np.zeros((0, 0))
         z = np.concatenate([rows for _, rows in self._halfway(functionals)])
         return np.asarray(z.T @ z)
 

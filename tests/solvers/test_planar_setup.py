@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from planar import STRAIGHT, changed, setup_of, trial, true_state
 
+from factorgraph_dvl import load_solution, save_trial
+from factorgraph_dvl.cli import main
 from factorgraph_dvl.errors import DataError, SolveError
 from factorgraph_dvl.plausibility.survey import survey
 from factorgraph_dvl.quality.finding import Code
@@ -98,3 +100,25 @@ def test_a_long_trial_before_a_jump_is_no_gap():
 def test_the_trajectory_of_a_trial_with_a_jump_is_no_longer_than_its_records():
     found = solve(jumping(trial(**SHORT), 5.0, 1.3e9), rate_hz=1.0)
     assert found.trajectory.time.size < 70
+
+
+def test_a_track_alone_is_solved_and_its_information_shown(tmp_path):
+    """Two beacons whose places are known, and a log over ground: no constant is estimated."""
+    places = {
+        "B1": {"lat_deg": 25.0, "lon_deg": 135.0, "height_m": -80},
+        "B2": {"lat_deg": 25.004, "lon_deg": 135.004, "height_m": -90},
+    }
+    made = trial(
+        manoeuvres=[{"straight_s": 75}],
+        beacons={"positions": places},
+        log={"reference": "bottom"},
+        current_m_s=[0, 0, 0],
+    )
+    save_trial(made, tmp_path / "trial")
+    for command in ("solve", "observability"):
+        with pytest.raises(SystemExit) as end:
+            main([command, str(tmp_path / "trial"), "--out", str(tmp_path / command)])
+        assert end.value.code == 0
+    found = load_solution(tmp_path / "solve")
+    assert found.estimates == ()
+    assert found.verdict.grade == "good"
