@@ -18,6 +18,7 @@ from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.square_root_information import (
     SquareRootInformation,
     eliminated,
+    eliminated_in_turn,
 )
 
 # Segments of a range at most. Chosen: those of an hour and a half; where many parameters are free,
@@ -146,10 +147,9 @@ def _eliminations(
         ordering, shared = problem.ordering(branches=False), set(_shared(problem))
         every = (ordering.at(i) for i in range(ordering.size()))
         order = [key for key in every if key not in shared]
-    for first in range(0, len(order), _AT_ONCE):
-        some = keys.ordering(order[first : first + _AT_ONCE])
-        tree, graph = graph.eliminatePartialMultifrontal(some, gtsam.EliminateQR)
-        yield tree, graph
+    held = [graph]
+    del graph
+    yield from eliminated_in_turn(held.pop(), order, _AT_ONCE)
 
 
 def _shared(problem: Problem) -> list[int]:

@@ -20,8 +20,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 
 # Parts in which variables are eliminated. Chosen: GTSAM keeps all rows that went into a
-# conditional, up to 60 kB for each state, of which a tenth is needed; each part looks through all
-# factors that are left.
+# conditional, up to 60 kB for each state, of which a tenth is needed.
 _PARTS = 16
 # Joint covariances that are held at once. Chosen: some ten megabytes.
 _AT_ONCE = 2048
@@ -421,18 +420,66 @@ def error_of_variance(
     return abs(x.dot(missing) - variance) / variance
 
 
+def eliminated_in_turn(
+    gaussian: gtsam.GaussianFactorGraph, order: Sequence[int], size: int
+) -> Iterator[tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]]:
+    """Yield the Bayes trees of one part of some variables after another, from QR.
+
+    Each elimination looks through the factors of its own part alone, not through all that are
+    left: that would take a time that grows with the square of their number.
+
+    Parameters
+    ----------
+    gaussian : gtsam.GaussianFactorGraph
+        All factors.
+    order : sequence of int
+        Keys of the variables in the order of elimination.
+    size : int
+        Number of variables of a part.
+
+    Yields
+    ------
+    tree : gtsam.GaussianBayesTree
+        What the elimination of a part leaves.
+    left : gtsam.GaussianFactorGraph
+        Factors without any of these variables: after the last part, all that are left.
+    """
+    part = {key: i // size for i, key in enumerate(order)}
+    count = -(-len(order) // size)
+    waiting = [gtsam.GaussianFactorGraph() for _ in range(count + 1)]
+
+    def distribute(graph: gtsam.GaussianFactorGraph) -> None:
+        for i in range(graph.size()):
+            factor = graph.at(i)
+            if factor is not None:
+                own = factor.keys()
+                first = min((part.get(key, count) for key in own), default=count)
+                waiting[first].push_back(factor)
+
+    distribute(gaussian)
+    # Factors that nobody else holds go once they are eliminated.
+    del gaussian
+    for k in range(count):
+        some = keys.ordering(order[k * size : (k + 1) * size])
+        tree, left = waiting[k].eliminatePartialMultifrontal(some, gtsam.EliminateQR)
+        waiting[k] = gtsam.GaussianFactorGraph()
+        distribute(left)
+        yield tree, waiting[count]
+
+
 def _trees(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> Iterator[gtsam.GaussianBayesTree]:
     """Yield the Bayes trees of one part of the variables after another."""
-    count = ordering.size()
-    size = -(-count // _PARTS) if count > _MANY else count
-    for first in range(0, count - size, size):
-        part = keys.ordering(ordering.at(i) for i in range(first, first + size))
-        tree, gaussian = gaussian.eliminatePartialMultifrontal(part, gtsam.EliminateQR)
+    order = [ordering.at(i) for i in range(ordering.size())]
+    size = -(-len(order) // _PARTS) if len(order) > _MANY else len(order)
+    last = size * ((len(order) - 1) // size)
+    held = [gaussian]
+    del gaussian
+    for tree, left in eliminated_in_turn(held.pop(), order[:last], size) if last else ():
+        held = [left]
         yield tree
-    last = keys.ordering(ordering.at(i) for i in range(size * ((count - 1) // size), count))
-    yield gaussian.eliminateMultifrontal(last, gtsam.EliminateQR)
+    yield held.pop().eliminateMultifrontal(keys.ordering(order[last:]), gtsam.EliminateQR)
 
 
 def _cliques_of(

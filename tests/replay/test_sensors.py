@@ -287,7 +287,7 @@ def test_a_scale_that_walks_is_reported_as_it_is_at_the_end():
 @pytest.mark.parametrize("factor", [0.25, 4.0])
 def test_noise_that_is_stated_wrong_is_estimated(factor):
     """Both solvers find how large the noise is, from which the replay goes on."""
-    trial = simulate(config("seed-a-phase-90", manoeuvres=TURNS), 1)
+    trial = with_no_window(simulate(config("seed-a-phase-90", manoeuvres=TURNS), 1))
     solution, _ = replay(stated(trial, factor, factor), rate_hz=2.0)
     right = solve(trial)
     for noise in solution.noise:
