@@ -136,6 +136,11 @@ def window_part(
         length = _ENOUGH // _STRETCHES
         first = np.linspace(0, count - length, _STRETCHES).astype(int)
         some = (first[:, None] + np.arange(length)).ravel()
+    return part_of(bound, some, evaluation), count / some.size
+
+
+def part_of(bound: BoundObservation, some: IntArray, evaluation: Evaluation) -> BoundObservation:
+    """Return some of the measurements of an observation, weighed and attached as they are."""
     part = replace(
         bound,
         observation=ObservationRows(bound.observation, some),
@@ -144,7 +149,7 @@ def window_part(
         weight=bound.weight[some],
     )
     part.attach(evaluation.parameters)
-    return part, count / some.size
+    return part
 
 
 def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
