@@ -69,6 +69,7 @@ ELSEWHERE = {
     "quality/star_catalogue": "sensors/test_star.py",
     "replay/initializer": "replay/test_session.py",
     "replay/playback": "replay/test_session.py",
+    "replay/record_navigator": "replay/test_navigator_without_imu.py",
     "report/figures/beams": "sensors/test_dvl_beams.py",
     "report/figures/crosscheck": "cli/test_crosscheck.py",
     "report/figures/dead_reckoning": "analysis/dead_reckoning/test_before_after.py",
