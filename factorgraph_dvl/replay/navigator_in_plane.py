@@ -12,25 +12,23 @@ from functools import cached_property
 
 import numpy as np
 
-from factorgraph_dvl.estimates import Noise, Trajectory, mixed
-from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.estimates import Trajectory, mixed
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.planar_chain import PlanarChain
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.message import Message
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.history import RecordHistory
-from factorgraph_dvl.replay.record_navigator import RecordNavigator
+from factorgraph_dvl.replay.record_navigator import RecordNavigator, RecordStart
 from factorgraph_dvl.replay.start import largest_misfit, not_one_minimum
 from factorgraph_dvl.replay.window import SteppedNodes
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.batch import settled_minimum
 from factorgraph_dvl.solvers.curved_posterior import points_along_arc
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.planar_setup import (
     PlanarSetup,
     Track,
@@ -84,9 +82,8 @@ class PlanarNodes(SteppedNodes):
     @cached_property
     def _points(self) -> tuple[list[SolvedProblem], Array]:
         """Tracks along the arc that ranges leave, and their weights; one where it is straight."""
-        minimum = Minimum(self.evaluation, self.information, converged=True, iterations=0)
         none = np.zeros((len(self._posterior.parameters), 0))
-        found = SolvedProblem(self.problem, minimum, self._posterior, none)
+        found = SolvedProblem(self.problem, self._minimum, self._posterior, none)
         points, costs = points_along_arc(found, self.places, lambda *_: None)
         weights = np.exp(costs[0] - costs)
         return points, weights / weights.sum()
@@ -105,38 +102,10 @@ class PlanarNodes(SteppedNodes):
 
 
 @dataclass(frozen=True)
-class StartInPlane:
-    """A batch solution of a planar trial.
-
-    Parameters
-    ----------
-    whole : PlanarNodes
-        All of its nodes.
-    trial : Trial
-        Records up to then.
-    trajectory : Trajectory
-        Motion after the time that `solve_start_in_plane` was given.
-    findings : tuple of Finding
-        What the user must know.
-    misfit : float
-        Largest RMS of the residuals of any kind of measurement, over what is stated.
-    """
+class StartInPlane(RecordStart):
+    """A batch solution of a planar trial; its noise is as stated."""
 
     whole: PlanarNodes
-    trial: Trial
-    trajectory: Trajectory
-    findings: tuple[Finding, ...]
-    misfit: float
-
-    @property
-    def frame(self) -> LocalFrame:
-        """Navigation frame of the nodes."""
-        return self.whole.chain.frame
-
-    @property
-    def noise(self) -> tuple[Noise, ...]:
-        """None: it is as stated."""
-        return ()
 
 
 def solve_start_in_plane(
@@ -175,7 +144,7 @@ def solve_start_in_plane(
     whole = PlanarNodes(problem, evaluation, settled.minimum.information, places=places)
     return StartInPlane(
         whole,
-        trial,
+        trial.body_axes,
         whole.motion(since, whole.last, trial.body_axes),
         settled.findings,
         largest_misfit(problem, evaluation),
@@ -210,15 +179,7 @@ class NavigatorInPlane(RecordNavigator):
         lag: float,
         before: RecordNavigator | None = None,
     ) -> None:
-        super().__init__(
-            start.whole,
-            start.frame,
-            start.trajectory,
-            gate,
-            lag=lag,
-            body_axes=start.trial.body_axes,
-            before=before,
-        )
+        super().__init__(start, gate, lag=lag, before=before)
         self._interval = interval
         problem = start.whole.problem
         self._parameters, self._clock_zero = problem.all_parameters, problem.clock_zero

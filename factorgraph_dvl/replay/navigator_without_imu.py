@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factorgraph_dvl.estimates import Noise, Trajectory
-from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.estimates import Noise
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, rotate
 from factorgraph_dvl.graph.problem import Evaluation, Problem
@@ -16,10 +15,9 @@ from factorgraph_dvl.graph.smooth_chain import SmoothChain, far_apart, without_l
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord, level_axes
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.replay.gate import InnovationGate
 from factorgraph_dvl.replay.history import RecordHistory
-from factorgraph_dvl.replay.record_navigator import RecordNavigator
+from factorgraph_dvl.replay.record_navigator import RecordNavigator, RecordStart
 from factorgraph_dvl.replay.start import largest_misfit
 from factorgraph_dvl.replay.window import (
     BatchSolution,
@@ -54,36 +52,20 @@ _SAME_TIME = 2e-4
 
 
 @dataclass(frozen=True)
-class StartWithoutImu:
-    """A batch solution of a trial without IMU, from which a window starts.
+class StartWithoutImu(RecordStart):
+    """A batch solution of a motion in space, from which a window starts.
 
     Parameters
     ----------
-    whole : Window
-        All of its nodes.
     count : int
-        Number of those by whose time all sensors have reported.
+        Number of the nodes by whose time all sensors have reported.
     batch : BatchSolution
         What windows take from it.
-    trajectory : Trajectory
-        Motion after the time that `solve_start_without_imu` was given.
-    findings : tuple of Finding
-        What the user must know.
-    misfit : float
-        Largest RMS of the residuals of any kind of measurement, over what is stated.
     """
 
     whole: Window
     count: int
     batch: BatchSolution
-    trajectory: Trajectory
-    findings: tuple[Finding, ...]
-    misfit: float
-
-    @property
-    def frame(self) -> LocalFrame:
-        """Navigation frame of the nodes."""
-        return self.batch.chain.frame
 
     @property
     def noise(self) -> tuple[Noise, ...]:
@@ -131,11 +113,12 @@ def solve_start_without_imu(
         return message("not_started.no_position")
     return StartWithoutImu(
         whole,
-        count,
-        BatchSolution.of(prepared, problem, until - clock_zero),
+        trial.body_axes,
         whole.motion(since, count - 1, trial.body_axes),
         (*prepared.findings, *settled.findings),
         largest_misfit(problem, minimum.evaluation),
+        count,
+        BatchSolution.of(prepared, problem, until - clock_zero),
     )
 
 
@@ -174,15 +157,7 @@ class NavigatorWithoutImu(RecordNavigator):
         before: RecordNavigator | None = None,
     ) -> None:
         whole, chain = start.whole, start.whole.chain
-        super().__init__(
-            whole,
-            start.frame,
-            start.trajectory,
-            gate,
-            lag=lag,
-            body_axes=start.batch.trial.body_axes,
-            before=before,
-        )
+        super().__init__(start, gate, lag=lag, before=before)
         self._batch = start.batch
         # By section, time of the last row that is before the window.
         self._since: dict[str, float] = {}

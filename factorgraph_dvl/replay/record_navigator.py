@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.estimates import Trajectory
+from factorgraph_dvl.estimates import Noise, Trajectory
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.records import concatenated
 from factorgraph_dvl.geometry.rotations import BodyAxes
@@ -21,23 +22,52 @@ from factorgraph_dvl.replay.record import Innovations
 from factorgraph_dvl.replay.window import SteppedNodes, information_without
 
 
+@dataclass(frozen=True)
+class RecordStart:
+    """A batch solution of a trial without IMU.
+
+    Parameters
+    ----------
+    whole : SteppedNodes
+        All of its nodes.
+    body_axes : BodyAxes
+        Axes of the body.
+    trajectory : Trajectory
+        Motion that it has found and that was asked for.
+    findings : tuple of Finding
+        What the user must know.
+    misfit : float
+        Largest RMS of the residuals of any kind of measurement, over what is stated.
+    """
+
+    whole: SteppedNodes
+    body_axes: BodyAxes
+    trajectory: Trajectory
+    findings: tuple[Finding, ...]
+    misfit: float
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Navigation frame of the nodes."""
+        return self.whole.problem.chain.frame
+
+    @property
+    def noise(self) -> tuple[Noise, ...]:
+        """Noise as it is reported: none that is estimated."""
+        return ()
+
+
 class RecordNavigator:
     """Navigation between two batch solutions, by records that grow.
 
     Parameters
     ----------
-    whole : SteppedNodes
+    start : RecordStart
         Batch solution to start from.
-    frame : LocalFrame
-        Navigation frame of its nodes.
-    first_motion : Trajectory
-        Motion that it has found.
     gate : InnovationGate
         Gate that decides which measurements are used.
     lag : float
         Age from which on motion counts as smoothed, s.
-    body_axes : BodyAxes
-        Axes of the body.
     before : RecordNavigator, optional
         What ran before.
 
@@ -45,6 +75,10 @@ class RecordNavigator:
     ----------
     window : SteppedNodes
         The newest nodes.
+    frame : LocalFrame
+        Navigation frame of the nodes.
+    first_motion : Trajectory
+        Motion that the start has found.
     rotation_change : float
         None that counts: every step is linear where the constants are.
     innovations : list of Innovations
@@ -57,23 +91,20 @@ class RecordNavigator:
 
     def __init__(
         self,
-        whole: SteppedNodes,
-        frame: LocalFrame,
-        first_motion: Trajectory,
+        start: RecordStart,
         gate: InnovationGate,
         *,
         lag: float,
-        body_axes: BodyAxes,
         before: RecordNavigator | None,
     ) -> None:
-        self.window = whole
-        self.frame, self.first_motion = frame, first_motion
-        self._gate, self._lag, self._body_axes = gate, lag, body_axes
+        self.window = start.whole
+        self.frame, self.first_motion = start.frame, start.trajectory
+        self._gate, self._lag, self._body_axes = gate, lag, start.body_axes
         self.innovations: list[Innovations] = []
         self.findings: list[Finding] = []
         # By label, times of measurements that are not used, and of the last one that was compared
         # with a prediction.
-        self._rejected = _left_out(whole.problem)
+        self._rejected = _left_out(start.whole.problem)
         self._compared: dict[str, float] = {} if before is None else before._compared
         self._smoothed: list[Trajectory] = [] if before is None else before._smoothed
         self._smoothed_to: float = -np.inf if before is None else before._smoothed_to

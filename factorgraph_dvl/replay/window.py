@@ -336,9 +336,13 @@ class SteppedNodes:
         root = self.problem.prior_root
         return np.asarray(root @ self._posterior.parameters @ root.T)
 
+    @property
+    def _minimum(self) -> Minimum:
+        return Minimum(self.evaluation, self.information, converged=True, iterations=0)
+
     @cached_property
     def _posterior(self) -> Posterior:
-        return posterior(self.problem, Minimum(self.evaluation, self.information, True, 0))
+        return posterior(self.problem, self._minimum)
 
     def newest(self, body_axes: BodyAxes) -> Trajectory:
         """Return the newest motion that is known, as a trajectory of one epoch."""
