@@ -121,7 +121,7 @@ def _scores(
     its place: it has a slope at 0.
     """
     evaluation = minimum.evaluation
-    part, share = window_part(problem, bound, evaluation)
+    part, share = window_part(bound, evaluation)
     information = minimum.square_root or factorized(problem, evaluation)[0]
     length = _length(bound)
     squares = {length: by_square(problem, part, evaluation)} if length in known else {}

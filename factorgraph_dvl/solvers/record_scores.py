@@ -126,9 +126,7 @@ def record_sums(
     return RecordSums(score, square, taken_up)
 
 
-def window_part(
-    problem: Problem, bound: BoundObservation, evaluation: Evaluation
-) -> tuple[BoundObservation, float]:
+def window_part(bound: BoundObservation, evaluation: Evaluation) -> tuple[BoundObservation, float]:
     """Return measurements of an observation that show its window, and how many each stands for."""
     count = bound.observation.time.size
     some: IntArray = np.arange(count)

@@ -126,7 +126,7 @@ def eliminated_by_ranges(part: Part, chain: Chain, *, whole: bool = False) -> St
 def _eliminations(
     problem: Problem, at: Evaluation, nodes: range | None, before: gtsam.GaussianFactorGraph
 ) -> Iterator[tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]]:
-    """Yield the eliminations of the states of a range, each with the graph that it leaves.
+    """Return the eliminations of the states of a range, each with the graph that it leaves.
 
     Beside the factors of the range are those that the ranges before leave.
     """
@@ -147,9 +147,7 @@ def _eliminations(
         ordering, shared = problem.ordering(branches=False), set(_shared(problem))
         every = (ordering.at(i) for i in range(ordering.size()))
         order = [key for key in every if key not in shared]
-    held = [graph]
-    del graph
-    yield from eliminated_in_turn(held.pop(), order, _AT_ONCE)
+    return eliminated_in_turn(graph, order, _AT_ONCE)
 
 
 def _shared(problem: Problem) -> list[int]:

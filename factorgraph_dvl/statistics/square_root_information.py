@@ -470,16 +470,12 @@ def eliminated_in_turn(
 def _trees(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> Iterator[gtsam.GaussianBayesTree]:
-    """Yield the Bayes trees of one part of the variables after another."""
-    order = [ordering.at(i) for i in range(ordering.size())]
-    size = -(-len(order) // _PARTS) if len(order) > _MANY else len(order)
-    last = size * ((len(order) - 1) // size)
-    held = [gaussian]
-    del gaussian
-    for tree, left in eliminated_in_turn(held.pop(), order[:last], size) if last else ():
-        held = [left]
-        yield tree
-    yield held.pop().eliminateMultifrontal(keys.ordering(order[last:]), gtsam.EliminateQR)
+    """Return the Bayes trees of one part of the variables after another."""
+    count = ordering.size()
+    if count <= _MANY:
+        return iter([gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)])
+    order = [ordering.at(i) for i in range(count)]
+    return (tree for tree, _ in eliminated_in_turn(gaussian, order, -(-count // _PARTS)))
 
 
 def _cliques_of(
