@@ -12,6 +12,7 @@ import numpy as np
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.elimination_order import Spans
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -113,9 +114,8 @@ class Chain(Protocol):
     def sizes(self) -> Sequence[int]:
         """Dimensions of the variables of a measurement, as `variables` has them."""
 
-    @property
-    def joints(self) -> Sequence[int]:
-        """Nodes between which branches lie: eliminated last, they leave each by itself."""
+    def spans(self, parameters: Mapping[str, Array]) -> Sequence[Spans]:
+        """Return the spans of time whose measurements depend on the variables of each node."""
 
     def part(self, block: slice) -> Chain:
         """Return the part of some segments in a row; states keep their keys."""
@@ -252,6 +252,10 @@ class AtTrueTimes:
     def shift(self, parameters: Mapping[str, Array]) -> float:
         """Return 0: attitudes are at the times of the nodes."""
         return 0.0
+
+    def spans(self: Chain, parameters: Mapping[str, Array]) -> list[Spans]:
+        """Return the spans of time whose measurements depend on the variables of each node."""
+        return [Spans([self.keys_of([k]) for k in range(self.node_time.size)], self.node_time)]
 
     def state_keys(self, k: int) -> list[int]:
         """Return the key of the state of node k."""

@@ -71,9 +71,6 @@ _GAP_SWAY_M = 0.1
 _GAP_SWAY_RAD = 10.0 * DEG
 # Stands for a standard deviation of 0 in `initial`, rad or m. Chosen: far below what is measured.
 _LEAST_STD = 1e-7
-# Nodes of a branch. Measured: the time that GTSAM takes for a single one grows with the square of
-# its length; for 19,200 nodes it is 1.4 s in one branch, and 0.4 s in branches of 32 or of 128.
-_BRANCH = 128
 # Steps of an accelerometer and a gyro bias that do not walk while the other does, m/s² and rad/s.
 # Chosen: regular, and below 0.1 µg and 0.001 deg/h in a day; with less, products with these rows
 # are rounding errors.
@@ -422,11 +419,6 @@ class InertialChain(AtTrueTimes):
         """Return the nodes from the first of some segments to that of the segments after them."""
         origin, count = self.segments.origin, self.segments.node_time.size
         return range(int(origin[block.start]), int(np.append(origin, count)[block.stop]))
-
-    @property
-    def joints(self) -> range:
-        """Nodes between which branches lie: eliminated last, they leave each by itself."""
-        return range(0, self.segments.node_time.size, _BRANCH)
 
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
         """Return the keys of the states at nodes, each with that of its bias where biases walk."""

@@ -24,8 +24,6 @@ from factorgraph_dvl.sensors.protocol import Linearization, Motion, Window
 SIZE = 4
 # Mean radius of the Earth, m. Measured: over 10 km a sphere errs by 3 cm in height.
 EARTH_RADIUS = 6.371e6
-# Nodes of a branch, as of the inertial chain.
-_BRANCH = 128
 # What rounding may add to a time, s.
 _ROUNDING = 1e-6
 
@@ -178,11 +176,6 @@ class PlanarChain(WithoutImu, AtTrueTimes):
     def sizes(self) -> list[int]:
         """Dimensions of the variables of a measurement."""
         return [SIZE, SIZE]
-
-    @property
-    def joints(self) -> range:
-        """Nodes between which branches lie: eliminated last, they leave each by itself."""
-        return range(0, self.node_time.size, _BRANCH)
 
     def until(self, nodes: int) -> PlanarChain:
         """Return the chain of the first nodes."""

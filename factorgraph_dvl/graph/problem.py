@@ -27,6 +27,7 @@ from factorgraph_dvl.graph.bound_observation import (
     processes_of,
 )
 from factorgraph_dvl.graph.chain import Chain
+from factorgraph_dvl.graph.elimination_order import Spans, elimination_order
 from factorgraph_dvl.graph.imu_errors import ImuErrors
 from factorgraph_dvl.graph.measurement_factors import Evaluation, MeasurementFactors, Rows
 from factorgraph_dvl.graph.native_graph import native_graph
@@ -41,7 +42,7 @@ from factorgraph_dvl.graph.priors import (
     prior_root,
     value_at,
 )
-from factorgraph_dvl.graph.processes import Process, in_time_order
+from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.template import jacobian_template
 from factorgraph_dvl.sensors.gross_errors import gross_errors
 from factorgraph_dvl.sensors.parameters import Parameter
@@ -578,20 +579,14 @@ class Problem:
                 step.first,
             )
 
-    def ordering(self, *, branches: bool = True) -> gtsam.Ordering:
-        """Return an elimination order in which biases and calibration come last.
-
-        In branches for a step by Cholesky's factorisation of the whole; else in time, for QR part
-        by part, which then leaves less to keep.
-        """
+    def ordering(self) -> gtsam.Ordering:
+        """Return an elimination order in which biases and calibration come last."""
+        every = self.chain.spans(self.bound_at)
+        of_processes = [
+            Spans([[p.key(j)] for j in range(p.time.size)], p.time) for p in self.processes
+        ]
+        first = elimination_order(self.chain.node_time, [*every, *of_processes])
         last = [*self.chain.constants, *(self._key[p.name] for p in self.parameters)]
-        time = self.chain.node_time
-        first = in_time_order(self.chain, self.processes)
-        if branches:
-            joints = set(self.chain.keys_of(self.chain.joints))
-            for p in self.processes:
-                joints.update(p.around(time[self.chain.joints]))
-            first = sorted(first, key=joints.__contains__)
         return keys.ordering([*first, *last])
 
     def key(self, name: str) -> int:

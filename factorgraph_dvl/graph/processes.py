@@ -7,7 +7,7 @@ that walks is one more component of the nodes, with a correlation time of severa
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,7 +16,6 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.sensors.protocol import ScaleWalk
 
 # Most of a correlation time between two nodes. Chosen: interpolation then leaves out 6 % of the
@@ -27,8 +26,6 @@ _GAP = 5.0
 # Correlation time of a scale that walks, in lengths of the record. Chosen: over one length its
 # changes then have 85 % of the variance of a walk.
 _LENGTHS = 3.0
-# Place of a process in the order of elimination, after the variables of a node of the same time.
-_LAST = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +127,6 @@ class Process:
         """Return the nodes before times (M,), and the weights of the nodes after them."""
         j = np.clip(np.searchsorted(self.time, time, side="right") - 1, 0, self.time.size - 2)
         return j, np.clip((time - self.time[j]) / (self.time[j + 1] - self.time[j]), 0.0, 1.0)
-
-    def around(self, time: Array) -> set[int]:
-        """Return the keys of the nodes before and after times (M,)."""
-        before, _ = self.place(time)
-        return {self.key(j) for j in np.union1d(before, before + 1).tolist()}
 
     def error(self, nodes: Array, time: Array) -> Array:
         """Return the error of each component of a node at times (M,), (M, size)."""
@@ -287,18 +279,3 @@ def node_times(time: Array, tau: float, sigma: Array, white: Array) -> Array:
             if np.ptp(p) > 0.0
         ]
     )
-
-
-def in_time_order(chain: Chain, processes: Sequence[Process]) -> list[int]:
-    """Return the keys of nodes and processes in the order of elimination.
-
-    In time: a node of a process goes when the last state that depends on it has gone. COLAMD's
-    order takes four times as long once there are processes.
-    """
-    items: list[tuple[float, int, int]] = []
-    for k, t in enumerate(chain.node_time.tolist()):
-        items += [(t, i, key) for i, key in enumerate(chain.keys_of([k]))]
-    for p in processes:
-        last = p.time.size - 1
-        items += [(float(p.time[min(j + 1, last)]), _LAST, p.key(j)) for j in range(last + 1)]
-    return [key for _, _, key in sorted(items)]

@@ -14,6 +14,7 @@ from factorgraph_dvl.geometry.rotations import log_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.chain import MOTION, StepRows, WithoutImu
+from factorgraph_dvl.graph.elimination_order import Spans
 from factorgraph_dvl.graph.priors import loose_diagonal
 from factorgraph_dvl.graph.smooth_motion import (
     Between,
@@ -39,8 +40,8 @@ _COMPONENTS = tuple(
 _FREE = np.repeat([np.pi, 1.0, 1e5, 1e2], 3)
 # Dimensions of attitude, rates and track, which is position and velocity in n.
 _TURN, _RATE, _TRACK = 3, 3, 6
-# Nodes of a branch, as of the inertial chain.
-_BRANCH = 128
+# Difference of times, s, without measurements in between. Chosen: what rounding makes.
+_SAME_TIME = 1e-6
 # What rounding may add to a time, s.
 _ROUNDING = 1e-6
 # Steps whose rows are made at once. Chosen: some ten megabytes.
@@ -157,15 +158,6 @@ class SmoothChain(WithoutImu):
         """Dimensions of the variables of a measurement."""
         return [_TURN, _RATE, _TURN, _RATE, _TRACK, _TRACK]
 
-    @property
-    def joints(self) -> list[int]:
-        """Nodes between which branches lie: eliminated last, they leave each by itself.
-
-        Two at a time: a measurement may depend on the track after a node, and on attitudes before.
-        """
-        first = range(_BRANCH, self.node_time.size - 1, _BRANCH)
-        return [k + i for k in first for i in (0, 1)]
-
     def part(self, block: slice) -> SmoothChain:
         """Return the part of some steps in a row; states keep their keys."""
         out = replace(self, block=block)
@@ -176,6 +168,16 @@ class SmoothChain(WithoutImu):
     def keys_of(self, nodes: Iterable[int]) -> list[int]:
         """Return the keys of the attitudes of nodes, each with those of its rates and track."""
         return [key for k in nodes for key in (keys.attitude(k), keys.rate(k), keys.node(k))]
+
+    def spans(self, parameters: Mapping[str, Array]) -> list[Spans]:
+        """Return the spans of time whose measurements depend on attitudes and track of nodes."""
+        every, time = range(self.node_time.size), self.node_time
+        late = self.attitude_shift - self.shift(parameters)
+        turns = Spans(
+            [[keys.attitude(k), keys.rate(k)] for k in every],
+            time if abs(late) < _SAME_TIME else time + late,
+        )
+        return [turns, Spans([[keys.node(k)] for k in every], time)]
 
     def state_keys(self, k: int) -> list[int]:
         """Return the keys of attitude, and of position and velocity, of node k."""

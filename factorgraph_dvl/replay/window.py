@@ -48,7 +48,8 @@ from factorgraph_dvl.solvers.true_times import (
     motion_at_true_times,
     nodes_late,
 )
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation, eliminated
+from factorgraph_dvl.statistics.elimination import eliminated
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 from factorgraph_dvl.trial import Trial
 
 # Density of acceleration in turns, m²/s³, until the first one; chosen: that of ships.
@@ -421,7 +422,7 @@ class Window(SteppedNodes):
             prior = prior or (len(own) == 1 and keys.is_process(own[0]))
             if prior or not gone.isdisjoint(own):
                 past.push_back(gaussian.at(i))
-        ordering = problem.ordering(branches=False)
+        ordering = problem.ordering()
         every = [ordering.at(i) for i in range(ordering.size())]
         leaving = keys.ordering(key for key in every if key in gone)
         _, rest = past.eliminatePartialMultifrontal(leaving, gtsam.EliminateQR)
@@ -508,7 +509,7 @@ def stepped(problem: Problem, at: Evaluation) -> Window:
 
 def _eliminated(problem: Problem, at: Evaluation) -> SquareRootInformation:
     try:
-        ordering = problem.ordering(branches=False)
+        ordering = problem.ordering()
         return eliminated(problem.linearize(at), ordering, at.values.dims())
     except (RuntimeError, np.linalg.LinAlgError):
         raise SolveError(

@@ -13,13 +13,9 @@ from factorgraph_dvl.errors import SolveError
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.statistics.elimination import cholesky, eliminated, error_of_variance
 from factorgraph_dvl.statistics.marginal_likelihood import every_constant
-from factorgraph_dvl.statistics.square_root_information import (
-    SquareRootInformation,
-    cholesky,
-    eliminated,
-    error_of_variance,
-)
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # A step is small when all of it together is this many standard deviations, squared and
 # halved: the decrease of the cost that the linear model still promises. Chosen: 0.004 σ.
@@ -284,7 +280,7 @@ class _Search:
 
     def _from_qr(self, graph: gtsam.GaussianFactorGraph) -> gtsam.VectorValues:
         """Return the step from QR, and keep the information."""
-        self.root = eliminated(graph, self.problem.ordering(branches=False), self.sizes)
+        self.root = eliminated(graph, self.problem.ordering(), self.sizes)
         delta = self.root.solution()
         self.promised = self._promise(delta)
         return delta
@@ -510,7 +506,7 @@ def factorized(
 ) -> tuple[SquareRootInformation, gtsam.VectorValues]:
     """Return the square-root information from QR at some values, and the step to the minimum."""
     gaussian = [problem.linearize(evaluation)]
-    ordering = problem.ordering(branches=False)
+    ordering = problem.ordering()
     # Nothing else holds the factors then, so that each goes once it is eliminated.
     problem.release()
     out = eliminated(gaussian.pop(), ordering, evaluation.values.dims())

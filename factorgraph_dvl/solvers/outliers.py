@@ -10,13 +10,13 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.levenberg_marquardt import quick_step
+from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.robust_weights import (
     Truncation,
     misfit,
     persistent_misfit,
     windows,
 )
-from factorgraph_dvl.statistics.square_root_information import eliminated
 from factorgraph_dvl.statistics.variance_components import LEAST_FACTOR
 
 # Measurements from which on outliers are searched. Chosen: fewer do not show their own scale.

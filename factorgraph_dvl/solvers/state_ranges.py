@@ -14,12 +14,9 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.statistics.elimination import eliminated, eliminated_in_turn
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
-from factorgraph_dvl.statistics.square_root_information import (
-    SquareRootInformation,
-    eliminated,
-    eliminated_in_turn,
-)
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Segments of a range at most. Chosen: those of an hour and a half; where many parameters are free,
 # rows of 15,000 take 0.4 GB.
@@ -85,10 +82,10 @@ class StateRanges:
                         block and block.start and shared.keys() >= set(each[0].keys[0].tolist())
                     )
                 ),
-                known | own,
+                known | dict(own),
             )
             # The range before depends on the first of these nodes.
-            known = dict(shared) | own
+            known = dict(shared) | dict(own)
 
 
 def eliminated_by_ranges(part: Part, chain: Chain, *, whole: bool = False) -> StateRanges:
@@ -141,12 +138,12 @@ def _eliminations(
     # Nothing else holds the factors then, so that each goes once it is eliminated.
     del gaussian
     problem.release()
+    ordering, shared = problem.ordering(), set(_shared(problem))
+    every = (ordering.at(i) for i in range(ordering.size()))
+    order = [key for key in every if key not in shared]
     if nodes:
-        order = problem.chain.keys_of(nodes)
-    else:
-        ordering, shared = problem.ordering(branches=False), set(_shared(problem))
-        every = (ordering.at(i) for i in range(ordering.size()))
-        order = [key for key in every if key not in shared]
+        own = set(problem.chain.keys_of(nodes))
+        order = [key for key in order if key in own]
     return eliminated_in_turn(graph, order, _AT_ONCE)
 
 

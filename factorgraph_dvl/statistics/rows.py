@@ -14,7 +14,7 @@ from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import PRIOR
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+from factorgraph_dvl.statistics.square_root_information import ByKey, SquareRootInformation
 
 CORRELATED = "correlated noise of {}"
 # Stands for the sources that the chain names.
@@ -53,6 +53,9 @@ def product(rows: Rows, columns: Mapping[int, Array]) -> Array:
     """Return the Jacobian times columns (size, n) of its variables by key, (M, d, n)."""
     total: Array | float = 0.0
     for own, matrix in _by_variable(rows):
+        if isinstance(columns, ByKey):
+            total = total + matrix @ columns.stacked(own, matrix.shape[2])
+            continue
         first = _runs(own)
         known = np.stack([columns[key] for key in own[first].tolist()])
         lengths = np.diff(first, append=own.size)
@@ -94,24 +97,13 @@ def with_own_covariance(
     information : SquareRootInformation
         Square-root information of all variables.
     """
-    place: dict[tuple[int, ...], int] = {}
     out = [np.zeros_like(matrix) for _, matrix in parts]
-    # By part: numbers of groups in order, and the items that have them.
-    items = []
-    for own, matrix in parts:
-        # What is not used need not be in the graph.
-        used = np.flatnonzero(np.any(matrix, axis=(1, 2)))
-        groups = [place.setdefault(tuple(k), len(place)) for k in own[used].tolist()]
-        order = np.argsort(groups, kind="stable")
-        items.append((np.array(groups, dtype=int)[order], used[order]))
-    for found, P in information.joint_in_parts(list(place)):
-        for (_, matrix), (numbers, used), product_ in zip(parts, items, out, strict=True):
-            first = np.searchsorted(numbers, found)
-            count = np.searchsorted(numbers, found, side="right") - first
-            if count.any():
-                behind = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-                some = used[np.repeat(first, count) + behind]
-                product_[some] = matrix[some] @ np.repeat(P, count, axis=0)
+    # What is not used need not be in the graph.
+    used = [np.flatnonzero(np.any(matrix, axis=(1, 2))) for _, matrix in parts]
+    groups = [own[some] for (own, _), some in zip(parts, used, strict=True)]
+    for part, items, P in information.joint_in_parts(groups):
+        some = used[part][items]
+        out[part][some] = parts[part][1][some] @ P
     return out
 
 

@@ -2,41 +2,86 @@
 
 The Bayes tree that QR elimination leaves contains the square root R of the information
 matrix clique by clique. Everything here is built from R: squaring it first would lose
-the digits that navigation-grade gyros need.
+the digits that navigation-grade gyros need. Cliques of one depth do not depend on each other, so
+those that look alike are treated together.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import compress
 
 import gtsam
 import numpy as np
-from scipy.linalg.lapack import dtrtrs
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
-from factorgraph_dvl.graph import keys
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 
-# Parts in which variables are eliminated. Chosen: GTSAM keeps all rows that went into a
-# conditional, up to 60 kB for each state, of which a tenth is needed.
-_PARTS = 16
-# Joint covariances that are held at once. Chosen: some ten megabytes.
-_AT_ONCE = 2048
-# Variables from which on there are parts. Chosen: fewer need little memory.
-_MANY = 500
+# Cliques whose joint covariances are there at once. Chosen: some ten megabytes.
+_AT_ONCE = 512
+
+
+class ByKey(Mapping[int, Array]):
+    """Rows (size, n) of variables by key, all in one table.
+
+    Parameters
+    ----------
+    keys : ndarray of int, shape (K,)
+        Keys in ascending order.
+    first : ndarray of int, shape (K + 1,)
+        Row at which those of each variable begin.
+    table : ndarray, shape (N, n)
+        Rows of all variables.
+    """
+
+    def __init__(self, keys: IntArray, first: IntArray, table: Array) -> None:
+        self._keys, self._first, self._table = keys, first, table
+
+    def __getitem__(self, key: int) -> Array:
+        i = int(np.searchsorted(self._keys, key))
+        if i == self._keys.size or self._keys[i] != key:
+            raise KeyError(key)
+        return self._table[self._first[i] : self._first[i + 1]]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._keys.tolist())
+
+    def __len__(self) -> int:
+        return self._keys.size
+
+    def stacked(self, keys: IntArray, size: int) -> Array:
+        """Return the rows (M, size, n) of variables of one size."""
+        rows = self._first[np.searchsorted(self._keys, keys)]
+        return np.asarray(self._table[rows[:, None] + np.arange(size)])
 
 
 @dataclass(frozen=True)
-class _Clique:
-    """Frontal variables F given separators S: R x_F + T x_S = d + noise of unit variance."""
+class _Cliques:
+    """Cliques of one depth that look alike: R x_F + T x_S = d + noise of unit variance.
 
-    frontals: tuple[int, ...]
-    separators: tuple[int, ...]
+    Parameters
+    ----------
+    numbers, parents : ndarray of int, shape (M,)
+        Numbers of the cliques, ascending, and of their parents.
+    frontals, separators : ndarray of int, shapes (M, f) and (M, s)
+        Components of x_F and x_S among all.
+    R, T, d : ndarray, shapes (M, f, f), (M, f, s) and (M, f)
+        Conditionals.
+    """
+
+    numbers: IntArray
+    parents: IntArray
+    frontals: IntArray
+    separators: IntArray
     R: Array
     T: Array
     d: Array
+
+
+# Numbers (M,) of cliques that look alike, components (M, w), and joint covariances (M, w, w).
+_Joint = tuple[IntArray, IntArray, Array]
 
 
 class SquareRootInformation:
@@ -55,37 +100,45 @@ class SquareRootInformation:
         trees: Iterable[gtsam.GaussianBayesTree | gtsam.GaussianBayesNet],
         sizes: Mapping[int, int],
     ) -> None:
-        self._sizes = sizes
-        # From the leaves to the root; then the other way round.
-        self._cliques: list[_Clique] = []
+        every: list[_Clique] = []
         for tree in trees:
-            self._cliques += reversed(_cliques_of(tree, sizes))
-        self._cliques.reverse()
-        self._indices: dict[tuple[tuple[int, int], ...], Array] = {}
+            every += reversed(_cliques_of(tree, sizes))
+        used = {key for clique in every for key in (*clique.frontals, *clique.separators)}
+        self._keys = np.array(sorted(used), dtype=int)
+        self._sizes = np.array([sizes[key] for key in self._keys.tolist()], dtype=int)
+        self._first = np.concatenate([[0], np.cumsum(self._sizes)])
+        # From the root to the leaves: cliques of each depth that look alike.
+        parts = {key: np.arange(own.start, own.stop) for key, own in self._rows.items()}
+        self._levels = _levels(every[::-1], parts)
 
     @cached_property
-    def _place(self) -> dict[int, int]:
-        """Number of the clique in which each variable is frontal."""
-        return {key: i for i, clique in enumerate(self._cliques) for key in clique.frontals}
+    def _rows(self) -> dict[int, slice]:
+        """Components of each variable among all, by key."""
+        slices = map(slice, self._first[:-1].tolist(), self._first[1:].tolist())
+        return dict(zip(self._keys.tolist(), slices, strict=True))
+
+    @property
+    def _cliques(self) -> list[_Cliques]:
+        return [cliques for level in self._levels for cliques in level]
 
     @cached_property
-    def _parents(self) -> list[int]:
-        """Number of each clique's parent, -1 where there is none."""
-        # That of the separator that was eliminated first: it has all the others.
-        return [
-            max((self._place.get(key, -1) for key in c.separators), default=-1)
-            for c in self._cliques
-        ]
+    def _place(self) -> IntArray:
+        """Number of the clique in which each component is frontal, -1 where it is in none."""
+        out = np.full(self._first[-1], -1)
+        for each in self._cliques:
+            out[each.frontals] = each.numbers[:, None]
+        return out
 
     @property
     def log_determinant(self) -> float:
         """Logarithm of the determinant of the information."""
-        return 2.0 * sum(float(np.log(np.abs(np.diag(c.R))).sum()) for c in self._cliques)
+        diagonals = (each.R.diagonal(axis1=1, axis2=2) for each in self._cliques)
+        return 2.0 * sum(float(np.log(np.abs(diagonal)).sum()) for diagonal in diagonals)
 
     @property
     def decrease(self) -> float:
         """Half the sum of squares that the minimum takes off that of the right-hand side."""
-        return 0.5 * sum(float(clique.d @ clique.d) for clique in self._cliques)
+        return 0.5 * sum(float(np.vdot(each.d, each.d)) for each in self._cliques)
 
     def given(self, known: Collection[int]) -> SquareRootInformation:
         """Return the information of the other variables where some stay as they are.
@@ -102,44 +155,25 @@ class SquareRootInformation:
         ValueError
             If others were eliminated after them.
         """
-        known = frozenset(known)
-        cliques = []
-        for clique in self._cliques:
-            kept = [key not in known for key in clique.separators]
-            frontals, R, d = clique.frontals, clique.R, clique.d
-            if not known.isdisjoint(frontals):
-                # The last clique may have some of both, of which the known ones come last.
-                frontals = tuple(key for key in frontals if key not in known)
-                if any(kept) or frontals != clique.frontals[: len(frontals)]:
-                    raise ValueError("the known variables must be eliminated after all others")
-                if not frontals:
-                    continue
-                n = sum(self._sizes[key] for key in frontals)
-                R, d = R[:n, :n], d[:n]
-            columns = np.repeat(np.array(kept, bool), [self._sizes[k] for k in clique.separators])
-            separators = tuple(compress(clique.separators, kept))
-            cliques.append(_Clique(frontals, separators, R, clique.T[: d.size, columns], d))
-        out = SquareRootInformation([], self._sizes)
-        out._cliques = cliques
+        is_known = np.repeat(np.isin(self._keys, list(known)), self._sizes)
+        out = copy(self)
+        vars(out).pop("_place", None)
+        out._levels = [
+            [kept for each in level for kept in _without(each, is_known)] for level in self._levels
+        ]
         return out
 
     def solution(self) -> gtsam.VectorValues:
         """Return the minimum of the graph."""
-        found: dict[int, Array] = {}
+        x = np.zeros((self._first[-1], 1))
+        for each in self._cliques:
+            x[each.frontals] = _upper(each.R, each.d[..., None] - each.T @ x[each.separators])
         out = gtsam.VectorValues()
-        for clique in self._cliques:
-            d = clique.d
-            if clique.separators:
-                d = d - clique.T @ np.concatenate([found[key] for key in clique.separators])
-            x = _solve(clique.R, d, transposed=False)
-            row = 0
-            for key in clique.frontals:
-                found[key] = x[row : row + self._sizes[key]]
-                out.insert(key, found[key])
-                row += self._sizes[key]
+        for i in np.flatnonzero(self._place[self._first[:-1]] >= 0).tolist():
+            out.insert(int(self._keys[i]), x[self._first[i] : self._first[i + 1], 0])
         return out
 
-    def covariance_with(self, functionals: Sequence[Mapping[int, Array]]) -> dict[int, Array]:
+    def covariance_with(self, functionals: Sequence[Mapping[int, Array]]) -> ByKey:
         """Return the covariance of every variable with linear functionals of all.
 
         P Wᵀ = R⁻¹ R⁻ᵀ Wᵀ: from the leaves to the root, and back.
@@ -151,26 +185,17 @@ class SquareRootInformation:
 
         Returns
         -------
-        dict of int to ndarray
+        ByKey
             Keys to (size, sum n) matrices.
         """
-        out: dict[int, Array] = {}
-        halfway = dict(self._halfway(functionals))
-        width = sum(next(iter(f.values())).shape[0] for f in functionals)
-        for index, clique in enumerate(self._cliques):
-            z = halfway.get(index)
-            if z is None:
-                z = np.zeros((clique.R.shape[0], width))
-            if clique.separators:
-                z = z - clique.T @ np.concatenate([out[key] for key in clique.separators])
-            x = _solve(clique.R, z, transposed=False)
-            row = 0
-            for key in clique.frontals:
-                out[key] = x[row : row + self._sizes[key]]
-                row += self._sizes[key]
-        return out
+        halfway = {int(each.numbers[0]): z for each, z in self._halfway(functionals)}
+        x = np.zeros((self._first[-1], _width(functionals)))
+        for each in self._cliques:
+            z = halfway.pop(int(each.numbers[0]), 0.0) - each.T @ x[each.separators]
+            x[each.frontals] = _upper(each.R, z)
+        return ByKey(self._keys, self._first, x)
 
-    def following(self, known: Mapping[int, Array]) -> dict[int, Array]:
+    def following(self, known: Mapping[int, Array]) -> ByKey:
         """Return how every variable follows others, on which the trees depend.
 
         Parameters
@@ -178,17 +203,13 @@ class SquareRootInformation:
         known : mapping of int to ndarray
             How the others follow n components, (size, n) by key.
         """
-        out: dict[int, Array] = {}
-        for clique in self._cliques:
-            above = np.concatenate(
-                [out[key] if key in out else known[key] for key in clique.separators]
-            )
-            x = _solve(clique.R, -clique.T @ above, transposed=False)
-            row = 0
-            for key in clique.frontals:
-                out[key] = x[row : row + self._sizes[key]]
-                row += self._sizes[key]
-        return out
+        x = np.zeros((self._first[-1], next(iter(known.values())).shape[1]))
+        for key, rows in known.items():
+            if key in self._rows:
+                x[self._rows[key]] = rows
+        for each in self._cliques:
+            x[each.frontals] = _upper(each.R, -each.T @ x[each.separators])
+        return ByKey(self._keys, self._first, x)
 
     def covariance_of(self, functionals: Sequence[Mapping[int, Array]]) -> Array:
         """Return the joint covariance of linear functionals of the variables.
@@ -205,277 +226,268 @@ class SquareRootInformation:
         ndarray, shape (sum n, sum n)
             Covariance.
         """
-        if not functionals:
-            return np.zeros((0, 0))
-        z = np.concatenate([rows for _, rows in self._halfway(functionals)])
-        return np.asarray(z.T @ z)
+        width = _width(functionals)
+        out = np.zeros((width, width))
+        for _, z in self._halfway(functionals):
+            rows = z.reshape(-1, width)
+            out += rows.T @ rows
+        return out
 
-    def _halfway(self, functionals: Sequence[Mapping[int, Array]]) -> Iterator[tuple[int, Array]]:
-        """Yield numbers of cliques, from the leaves to the root, and the rows of z with Rᵀ z = Wᵀ.
+    def _halfway(
+        self, functionals: Sequence[Mapping[int, Array]]
+    ) -> Iterator[tuple[_Cliques, Array]]:
+        """Yield cliques, from the leaves to the root, and their rows (M, f, n) of z, Rᵀ z = Wᵀ.
 
-        Cliques whose rows are zero are left out.
+        Cliques whose rows are all zero are left out.
         """
-        widths = [next(iter(f.values())).shape[0] for f in functionals]
-        edges = np.cumsum([0, *widths])
-        total = int(edges[-1])
-        pending: dict[int, Array] = {}
-        for functional, first, last in zip(functionals, edges, edges[1:], strict=False):
+        w = np.zeros((self._first[-1], _width(functionals)))
+        column = 0
+        for functional in functionals:
             for key, matrix in functional.items():
-                block = pending.setdefault(key, np.zeros((self._sizes[key], total)))
-                block[:, first:last] += matrix.T
-        for index in reversed(range(len(self._cliques))):
-            clique = self._cliques[index]
-            if pending.keys().isdisjoint(clique.frontals):
-                continue
-            w = np.concatenate(
-                [pending.pop(key, np.zeros((self._sizes[key], total))) for key in clique.frontals]
-            )
-            z = _solve(clique.R, w, transposed=True)
-            yield index, z
-            passed = -clique.T.T @ z
-            row = 0
-            for key in clique.separators:
-                size = self._sizes[key]
-                pending[key] = pending.get(key, 0.0) + passed[row : row + size]
-                row += size
+                if key in self._rows:
+                    w[self._rows[key], column : column + len(matrix)] += matrix.T
+            column += len(next(iter(functional.values())))
+        for each in reversed(self._cliques):
+            own = w[each.frontals]
+            if own.any():
+                z = _lower(each.R.transpose(0, 2, 1), own)
+                yield each, z
+                _subtract(w, each.separators, each.T.transpose(0, 2, 1) @ z)
 
     def marginals(self, wanted: Sequence[int]) -> dict[int, Array]:
-        """Return the marginal covariances of variables by key.
-
-        From the root down, each clique's joint covariance follows from that of its
-        separators: P_FS = -R⁻¹ T P_SS, P_FF = R⁻¹R⁻ᵀ - P_FS (R⁻¹ T)ᵀ.
-        """
-        left = set(wanted)
-        out: dict[int, Array] = {}
-        for clique, place, P in self._joint():
-            for key in clique.frontals:
-                if key in left:
-                    own = slice(place[key], place[key] + self._sizes[key])
-                    block = P[own, own]
-                    out[key] = 0.5 * (block + block.T)
-        return out
+        """Return the marginal covariances of variables by key."""
+        every = self.joint_covariances([(key,) for key in wanted])
+        return {key: 0.5 * (P + P.T) for key, P in zip(wanted, every, strict=True)}
 
     def joint_covariances(self, groups: Sequence[tuple[int, ...]]) -> list[Array]:
-        """Return the joint covariances of groups of variables that a factor ties together.
-
-        Such variables share a clique: that of the one that was eliminated first.
-        """
+        """Return the joint covariances of groups of variables that a factor ties together."""
+        alike: defaultdict[tuple[int, ...], list[int]] = defaultdict(list)
+        size = dict(zip(self._keys.tolist(), self._sizes.tolist(), strict=True))
+        for i, group in enumerate(groups):
+            alike[tuple(size[key] for key in group)].append(i)
+        numbers = list(alike.values())
+        keys = [np.array([groups[i] for i in own]) for own in numbers]
         out: list[Array] = [np.empty((0, 0))] * len(groups)
-        for numbers, found in self.joint_in_parts(groups):
-            for i, P in zip(numbers.tolist(), found, strict=True):
-                out[i] = P
+        for part, items, found in self.joint_in_parts(keys):
+            for i, P in zip(items.tolist(), found, strict=True):
+                out[numbers[part][i]] = P
         return out
 
-    def joint_in_parts(
-        self, groups: Sequence[tuple[int, ...]]
-    ) -> Iterator[tuple[IntArray, Array]]:
-        """Yield numbers (B,) of groups and their `joint_covariances` (B, n, n), some at a time."""
-        wanted: dict[int, list[int]] = {}
-        for i, group in enumerate(groups):
-            wanted.setdefault(max(self._place[key] for key in group), []).append(i)
-        # Of cliques that look alike: numbers of groups, covariances of cliques, and components.
-        alike: dict[tuple[int, int], tuple[list[int], list[Array], Array]] = {}
-        count = 0
-        for index, (_, place, P) in enumerate(self._joint()):
-            for i in wanted.get(index, ()):
-                rows = self._components(place, groups[i])
-                kind = len(P), id(rows)
-                if kind not in alike:
-                    alike[kind] = [], [], rows
-                numbers, cliques, _ = alike[kind]
-                numbers.append(i)
-                cliques.append(P)
-                count += 1
-            if count >= _AT_ONCE:
-                yield from map(_selected, alike.values())
-                alike, count = {}, 0
-        yield from map(_selected, alike.values())
+    def joint_in_parts(self, parts: Sequence[IntArray]) -> Iterator[tuple[int, IntArray, Array]]:
+        """Yield the joint covariances of groups of variables, some groups at a time.
 
-    def _components(self, place: Mapping[int, int], keys_: tuple[int, ...]) -> Array:
-        """Return the components of variables among those of a clique: alike in most cliques."""
-        shape = tuple((place[key], self._sizes[key]) for key in keys_)
-        found = self._indices.get(shape)
-        if found is None:
-            found = np.concatenate([np.arange(start, start + size) for start, size in shape])
-            self._indices[shape] = found
-        return found
+        The variables of a group share a clique, as those of a factor do: that of the one that was
+        eliminated first.
 
-    def _joint(self) -> Iterator[tuple[_Clique, dict[int, int], Array]]:
-        """Yield each clique, where its variables begin, and their joint covariance."""
-        # Of cliques whose children are still to come.
-        joint: dict[int, tuple[dict[int, int], Array]] = {}
-        children = [0] * len(self._cliques)
-        for parent in self._parents:
-            if parent >= 0:
-                children[parent] += 1
-        for index, (clique, parent) in enumerate(zip(self._cliques, self._parents, strict=True)):
-            f = clique.R.shape[0]
-            identity = np.eye(f)
-            solved = _solve(clique.R, np.hstack([identity, clique.T]), transposed=False)
-            inverse, gain = solved[:, :f], solved[:, f:]
-            s = clique.T.shape[1]
-            P = np.empty((f + s, f + s))
-            if s:
-                where, above = joint[parent]
-                rows = self._components(where, clique.separators)
-                P_SS = above[rows[:, None], rows]
-                P_FS = -gain @ P_SS
-                # An asymmetry would double from one clique to the next where biases walk far.
-                P_FF = inverse @ inverse.T - P_FS @ gain.T
-                P[:f, :f] = 0.5 * (P_FF + P_FF.T)
-                P[:f, f:], P[f:, :f], P[f:, f:] = P_FS, P_FS.T, P_SS
-            else:
-                P[:] = inverse @ inverse.T
-            place: dict[int, int] = {}
-            row = 0
-            for key in (*clique.frontals, *clique.separators):
-                place[key] = row
-                row += self._sizes[key]
-            if children[index]:
-                joint[index] = place, P
-            if parent >= 0:
-                children[parent] -= 1
-                if not children[parent]:
-                    del joint[parent]
-            yield clique, place, P
+        Parameters
+        ----------
+        parts : sequence of ndarray of int, shape (M, k)
+            Keys of the variables of M groups: in each part of the same sizes.
+
+        Yields
+        ------
+        part : int
+            Number of the part.
+        items : ndarray of int, shape (B,)
+            Numbers of groups of the part.
+        P : ndarray, shape (B, n, n)
+            Covariances.
+        """
+        wanted = [self._by_clique(keys) for keys in parts]
+        for numbers, inside, P in self._joint():
+            for part, (own, clique, order) in enumerate(wanted):
+                first = np.searchsorted(clique, numbers)
+                count = np.searchsorted(clique, numbers, side="right") - first
+                if count.any():
+                    behind = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+                    items = np.repeat(first, count) + behind
+                    i = np.repeat(np.arange(numbers.size), count)
+                    yield part, order[items], _among(P, inside, i, own[items])
+
+    def _by_clique(self, keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+        """Return groups in the order of their cliques: components, cliques, and numbers."""
+        if not len(keys):
+            return np.zeros((0, 0), int), np.zeros(0, int), np.zeros(0, int)
+        place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
+        if (self._keys[place] != keys).any():
+            raise KeyError("a variable of a group is not in the graph")
+        sizes = self._sizes[place[0]]
+        within = np.concatenate([np.arange(size) for size in sizes.tolist()])
+        own = self._first[place].repeat(sizes, axis=1) + within
+        # The one that was eliminated first has the greatest number.
+        clique = self._place[own].max(axis=1)
+        order = np.argsort(clique, kind="stable")
+        return own[order], clique[order], order
+
+    def _joint(self) -> Iterator[_Joint]:
+        """Yield the joint covariances of some cliques that look alike, from the root down."""
+        above: list[_Joint] = []
+        for level, below in zip(self._levels, [*self._levels[1:], []], strict=True):
+            parents = np.concatenate([np.zeros(0, int), *(each.parents for each in below)])
+            here = []
+            for each in level:
+                for start in range(0, len(each.R), _AT_ONCE):
+                    some = _joint_of(each, slice(start, start + _AT_ONCE), above)
+                    if np.isin(some[0], parents).any():
+                        here.append(some)
+                    yield some
+            above = here
 
 
-def _selected(some: tuple[list[int], list[Array], Array]) -> tuple[IntArray, Array]:
-    """Return numbers, and components of the covariances of cliques that look alike."""
-    numbers, cliques, rows = some
-    return np.array(numbers), np.stack(cliques)[:, rows[:, None], rows]
+def _joint_of(each: _Cliques, some: slice, above: Sequence[_Joint]) -> _Joint:
+    """Return the joint covariances of some cliques from those of their parents.
+
+    P_FS = -R⁻¹ T P_SS and P_FF = R⁻¹R⁻ᵀ - P_FS (R⁻¹ T)ᵀ, with P_SS that of the separators.
+    """
+    R, T, separators = each.R[some], each.T[some], each.separators[some]
+    count, f, s = T.shape
+    inside = np.hstack([each.frontals[some], separators])
+    identity = np.broadcast_to(np.eye(f), R.shape)
+    solved = _upper(R, np.concatenate([identity, T], axis=2))
+    inverse, gain = solved[:, :, :f], solved[:, :, f:]
+    P = np.empty((count, f + s, f + s))
+    P_FF = inverse @ inverse.transpose(0, 2, 1)
+    if s:
+        P_SS = P[:, f:, f:]
+        parents = each.parents[some]
+        for numbers, of_parent, joint in above:
+            own = np.flatnonzero(np.isin(parents, numbers))
+            if own.size:
+                i = np.searchsorted(numbers, parents[own])
+                P_SS[own] = _among(joint, of_parent, i, separators[own])
+        P_FS = -gain @ P_SS
+        P_FF = P_FF - P_FS @ gain.transpose(0, 2, 1)
+        P[:, :f, f:], P[:, f:, :f] = P_FS, P_FS.transpose(0, 2, 1)
+    # An asymmetry would double from one clique to the next where biases walk far.
+    P[:, :f, :f] = 0.5 * (P_FF + P_FF.transpose(0, 2, 1))
+    return each.numbers[some], inside, P
 
 
-def eliminated(
-    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, sizes: Mapping[int, int]
-) -> SquareRootInformation:
-    """Return the square-root information of a graph from QR.
-
-    QR does not square the condition of the problem.
+def _among(P: Array, inside: IntArray, number: IntArray, wanted: IntArray) -> Array:
+    """Return the covariances (B, n, n) of some components of cliques.
 
     Parameters
     ----------
-    gaussian : gtsam.GaussianFactorGraph
-        All factors.
-    ordering : gtsam.Ordering
-        All variables in the order of elimination.
-    sizes : mapping of int to int
-        Dimension of every variable by key.
+    P : ndarray, shape (M, w, w)
+        Joint covariances of cliques.
+    inside : ndarray of int, shape (M, w)
+        Their components.
+    number : ndarray of int, shape (B,)
+        Which clique has those that are wanted.
+    wanted : ndarray of int, shape (B, n)
+        Components.
     """
-    trees = _trees(gaussian, ordering)
-    # Factors that nobody else holds go once they are eliminated.
-    del gaussian
-    return SquareRootInformation(trees, sizes)
+    order = np.argsort(inside, axis=1)
+    base = int(inside.max(initial=0)) + 1
+    lines = np.take_along_axis(inside, order, axis=1) + base * np.arange(len(inside))[:, None]
+    found = np.searchsorted(lines.ravel(), wanted + base * number[:, None])
+    at = order.ravel()[found]
+    return np.asarray(P[number[:, None, None], at[:, :, None], at[:, None]])
 
 
-def cholesky(
-    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
-) -> gtsam.GaussianBayesTree | gtsam.GaussianBayesNet | None:
-    """Return what Cholesky's factorisation leaves, None where it has no digits.
-
-    GTSAM refuses some cliques of several variables of different units, whose factors have all
-    digits: then it takes one variable after another.
-
-    Parameters
-    ----------
-    gaussian : gtsam.GaussianFactorGraph
-        All factors.
-    ordering : gtsam.Ordering
-        All variables in the order of elimination.
-    """
-    for eliminate in (gaussian.eliminateMultifrontal, gaussian.eliminateSequential):
-        try:
-            return eliminate(ordering)
-        except RuntimeError:
-            continue
-    return None
-
-
-def error_of_variance(
-    gaussian: gtsam.GaussianFactorGraph,
-    information: SquareRootInformation,
-    functional: Mapping[int, Array],
-) -> float:
-    """Return the relative error of a variance by rounding, to first order.
-
-    With w the functional, x = P wᵀ from the factorisation and H the information from the factors,
-    the exact variance is w x - xᵀ (H x - wᵀ), to first order in H x - wᵀ (iterative refinement:
-    Golub and Van Loan, Matrix Computations, 4th ed., section 3.5.3).
-
-    Parameters
-    ----------
-    gaussian : gtsam.GaussianFactorGraph
-        All factors.
-    information : SquareRootInformation
-        Their factorisation.
-    functional : mapping of int to ndarray
-        The functional w, (1, size) by key.
-    """
-    x = gtsam.VectorValues()
-    for key, column in information.covariance_with([functional]).items():
-        x.insert(key, column[:, 0])
-    missing = gaussian.gradient(x).subtract(gaussian.gradientAtZero())
-    along = {key: float(w[0] @ x.at(key)) for key, w in functional.items()}
-    variance = sum(along.values())
-    return abs(x.dot(missing) - variance) / variance
+def _without(each: _Cliques, is_known: BoolArray) -> Iterator[_Cliques]:
+    """Yield cliques, alike again, in which what is known (N,) is zero."""
+    left = ~is_known[each.frontals]
+    kept = ~is_known[each.separators]
+    patterns = np.hstack([left, kept])
+    if (patterns == patterns[0]).all():
+        alike = [np.arange(len(patterns))]
+    else:
+        _, number = np.unique(patterns, axis=0, return_inverse=True)
+        alike = [np.flatnonzero(number == i) for i in range(int(number.max()) + 1)]
+    for own in alike:
+        f, columns = left[own[0]], np.flatnonzero(kept[own[0]])
+        n = int(f.sum())
+        # The last clique may have some of both, of which the known ones come last.
+        if n < f.size and (columns.size or f[n:].any()):
+            raise ValueError("the known variables must be eliminated after all others")
+        if n:
+            yield _Cliques(
+                each.numbers[own],
+                each.parents[own],
+                each.frontals[own, :n],
+                each.separators[own][:, columns],
+                each.R[own, :n, :n],
+                each.T[own, :n][:, :, columns],
+                each.d[own, :n],
+            )
 
 
-def eliminated_in_turn(
-    gaussian: gtsam.GaussianFactorGraph, order: Sequence[int], size: int
-) -> Iterator[tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]]:
-    """Yield the Bayes trees of one part of some variables after another, from QR.
-
-    Each elimination looks through the factors of its own part alone, not through all that are
-    left: that would take a time that grows with the square of their number.
-
-    Parameters
-    ----------
-    gaussian : gtsam.GaussianFactorGraph
-        All factors.
-    order : sequence of int
-        Keys of the variables in the order of elimination.
-    size : int
-        Number of variables of a part.
-
-    Yields
-    ------
-    tree : gtsam.GaussianBayesTree
-        What the elimination of a part leaves.
-    left : gtsam.GaussianFactorGraph
-        Factors without any of these variables: after the last part, all that are left.
-    """
-    part = {key: i // size for i, key in enumerate(order)}
-    count = -(-len(order) // size)
-    waiting = [gtsam.GaussianFactorGraph() for _ in range(count + 1)]
-
-    def distribute(graph: gtsam.GaussianFactorGraph) -> None:
-        for i in range(graph.size()):
-            factor = graph.at(i)
-            if factor is not None:
-                own = factor.keys()
-                first = min((part.get(key, count) for key in own), default=count)
-                waiting[first].push_back(factor)
-
-    distribute(gaussian)
-    # Factors that nobody else holds go once they are eliminated.
-    del gaussian
-    for k in range(count):
-        some = keys.ordering(order[k * size : (k + 1) * size])
-        tree, left = waiting[k].eliminatePartialMultifrontal(some, gtsam.EliminateQR)
-        waiting[k] = gtsam.GaussianFactorGraph()
-        distribute(left)
-        yield tree, waiting[count]
+def _width(functionals: Sequence[Mapping[int, Array]]) -> int:
+    return sum(len(next(iter(functional.values()))) for functional in functionals)
 
 
-def _trees(
-    gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
-) -> Iterator[gtsam.GaussianBayesTree]:
-    """Return the Bayes trees of one part of the variables after another."""
-    count = ordering.size()
-    if count <= _MANY:
-        return iter([gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)])
-    order = [ordering.at(i) for i in range(count)]
-    return (tree for tree, _ in eliminated_in_turn(gaussian, order, -(-count // _PARTS)))
+def _upper(R: Array, rhs: Array) -> Array:
+    """Return R⁻¹ rhs of upper triangles: their elimination with pivots is substitution."""
+    try:
+        return np.asarray(np.linalg.solve(R, rhs))
+    except np.linalg.LinAlgError:
+        message = "the square root of the information matrix is singular"
+        raise np.linalg.LinAlgError(message) from None
+
+
+def _lower(L: Array, rhs: Array) -> Array:
+    """Return L⁻¹ rhs of lower triangles: upper ones from the last row to the first."""
+    return _upper(L[:, ::-1, ::-1], rhs[:, ::-1])[:, ::-1]
+
+
+def _subtract(w: Array, rows: IntArray, by: Array) -> None:
+    """Subtract (M, s, n) from rows (M, s) of a table, of which some may be the same."""
+    if len(rows) == 1:
+        w[rows[0]] -= by[0]
+        return
+    flat = rows.ravel()
+    order = np.argsort(flat, kind="stable")
+    first = np.flatnonzero(np.diff(flat[order], prepend=-1))
+    if first.size:
+        sums = np.add.reduceat(by.reshape(flat.size, -1)[order], first, axis=0)
+        w[flat[order[first]]] -= sums
+
+
+@dataclass(frozen=True)
+class _Clique:
+    """Frontal variables F given separators S: R x_F + T x_S = d + noise of unit variance."""
+
+    frontals: tuple[int, ...]
+    separators: tuple[int, ...]
+    R: Array
+    T: Array
+    d: Array
+
+
+def _levels(every: Sequence[_Clique], components: Mapping[int, IntArray]) -> list[list[_Cliques]]:
+    """Return cliques of each depth that look alike, from cliques after their parents."""
+    place = {key: i for i, clique in enumerate(every) for key in clique.frontals}
+    # The parent is that of the separator that was eliminated first: it has all the others.
+    parents = [max((place.get(key, -1) for key in c.separators), default=-1) for c in every]
+    depths: list[int] = []
+    alike: list[defaultdict[tuple[int, ...], list[int]]] = []
+    for i, (clique, parent) in enumerate(zip(every, parents, strict=True)):
+        depths.append(depths[parent] + 1 if parent >= 0 else 0)
+        if depths[i] == len(alike):
+            alike.append(defaultdict(list))
+        alike[depths[i]][clique.T.shape].append(i)
+
+    def together(numbers: list[int]) -> _Cliques:
+        some = [every[i] for i in numbers]
+        none = np.zeros(0, int)
+
+        def stacked(keys: Iterable[tuple[int, ...]]) -> IntArray:
+            rows = [np.concatenate([none, *map(components.__getitem__, own)]) for own in keys]
+            return np.stack(rows)
+
+        return _Cliques(
+            np.array(numbers),
+            np.array([parents[i] for i in numbers]),
+            stacked(clique.frontals for clique in some),
+            stacked(clique.separators for clique in some),
+            # GTSAM may leave something below the diagonal.
+            np.triu(np.stack([clique.R for clique in some])),
+            np.stack([clique.T for clique in some]),
+            np.stack([clique.d for clique in some]),
+        )
+
+    return [[together(numbers) for numbers in level.values()] for level in alike]
 
 
 def _cliques_of(
@@ -502,10 +514,3 @@ def _clique_of(conditional: gtsam.GaussianConditional, sizes: Mapping[int, int])
         count += 1
     frontals, separators = tuple(own[:count]), tuple(own[count:])
     return _Clique(frontals, separators, R, np.array(conditional.S()), np.array(conditional.d()))
-
-
-def _solve(R: Array, rhs: Array, *, transposed: bool) -> Array:
-    solution, info = dtrtrs(R, rhs, trans=int(transposed))
-    if info != 0:
-        raise np.linalg.LinAlgError("the square root of the information matrix is singular")
-    return np.asarray(solution)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -12,7 +11,7 @@ from problems import SHORT, problem_of
 from problems import walking as walking_biases
 from truth import scenario
 
-from factorgraph_dvl.graph import inertial_chain, keys
+from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process, node_times
 from factorgraph_dvl.sensors.protocol import ScaleWalk
@@ -207,8 +206,7 @@ def test_nodes_leave_out_what_was_not_measured():
 
 @pytest.mark.parametrize("walks", [False, True])
 @pytest.mark.parametrize("labels", [[], ["GNSS position", "DVL velocity"]])
-def test_branches_of_states_and_processes_are_joined_by_what_goes_last(walks, labels, monkeypatch):
-    monkeypatch.setattr(inertial_chain, "_BRANCH", 10)
+def test_both_halves_of_a_trial_depend_on_each_other_only_by_what_goes_last(walks, labels):
     scene = walking_biases() if walks else scenario(manoeuvres=SHORT)
     plain, start = problem_of(scene)
     time = plain.chain.segments.node_time
@@ -222,27 +220,17 @@ def test_branches_of_states_and_processes_are_joined_by_what_goes_last(walks, la
     ordering = problem.ordering()
     order = [ordering.at(i) for i in range(ordering.size())]
     assert sorted(order) == sorted(start.keys())
-    first = next(i for i, key in enumerate(order) if key == keys.node(0))
-    branch = {key: key for key in order[:first]}
-
-    def root(key):
-        return key if branch[key] == key else root(branch[key])
-
+    middle = 2 ** int(np.log2(time.size)) - 1
+    before = order[: order.index(keys.node(middle))]
+    half = {key: keys.index_of(key) < middle for key in before if keys.letter_of(key) in "xb"}
+    for p in processes:
+        half |= {p.key(j): t < time[middle] for j, t in enumerate(p.time) if p.key(j) in before}
+    assert set(half) == set(before)
+    assert set(half.values()) == {True, False}
     gaussian = problem.linearize(problem.evaluate(start))
     for i in range(gaussian.size()):
         involved = gaussian.at(i).keys()
-        own = [key for key in involved if key in branch]
-        for one, other in pairwise(own):
-            branch[root(one)] = root(other)
-    by_branch = {}
-    for key in branch:
-        by_branch.setdefault(root(key), []).append(key)
-    states = [
-        {keys.index_of(key) // 10 for key in each if keys.letter_of(key) == "x"}
-        for each in by_branch.values()
-    ]
-    assert all(len(each) <= 1 for each in states)
-    assert set().union(*states) == set(range(-(-(time.size - 1) // 10)))
+        assert len({half[key] for key in involved if key in half}) <= 1
 
 
 def test_nodes_of_another_layout_start_without_an_error():

@@ -14,8 +14,8 @@ from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.calibration import calibration, reported
 from factorgraph_dvl.solvers.error_budget import causes, error_budget
+from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.rows import rows_by_source
-from factorgraph_dvl.statistics.square_root_information import eliminated
 
 SCENE = scenario(noise=True, manoeuvres=TURNING[:3], imu={"rate_hz": 50})
 

@@ -63,7 +63,7 @@ class AtAKink:
         graph.add(0, np.eye(1), np.sqrt([2.0 * evaluation.cost]), unit)
         return graph
 
-    def ordering(self, *, branches=True):
+    def ordering(self):
         out = gtsam.Ordering()
         out.push_back(0)
         return out
@@ -115,7 +115,7 @@ class Curved:
         graph.add(0, np.zeros((1, 1)), np.sqrt([rest]), unit)
         return graph
 
-    def ordering(self, *, branches=True):
+    def ordering(self):
         out = gtsam.Ordering()
         for key in (0, 1):
             out.push_back(key)

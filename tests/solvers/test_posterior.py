@@ -10,8 +10,8 @@ from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
 
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.statistics import square_root_information
-from factorgraph_dvl.statistics.square_root_information import eliminated
+from factorgraph_dvl.statistics import elimination
+from factorgraph_dvl.statistics.elimination import eliminated
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])
@@ -43,8 +43,8 @@ def system(request):
 
 def test_elimination_in_parts_and_in_time_gives_the_same(system, monkeypatch):
     problem, whole, _, _, gaussian, sizes = system
-    monkeypatch.setattr(square_root_information, "_MANY", 0)
-    in_parts = eliminated(gaussian, problem.ordering(branches=False), sizes)
+    monkeypatch.setattr(elimination, "_MANY", 0)
+    in_parts = eliminated(gaussian, problem.ordering(), sizes)
     every = [{problem.key(p.name): np.eye(p.mean.size)} for p in problem.parameters]
     np.testing.assert_allclose(
         in_parts.covariance_of(every), whole.covariance_of(every), rtol=1e-6

@@ -11,6 +11,7 @@ from findings import of_code
 from problems import SHORT
 from truth import scenario
 
+from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
@@ -70,7 +71,11 @@ def test_another_problem_and_another_order_have_the_same_objective(settled):
     for bound, weight in zip(again.bound, problem.weights, strict=True):
         bound.weight = weight
     there = again.evaluate(evaluation.values)
-    again.ordering = lambda *, branches=True: Problem.ordering(again, branches=not branches)
+    ordering = problem.ordering()
+    order = [ordering.at(i) for i in range(ordering.size())]
+    last = [*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)]
+    of_states = sorted(set(order).difference(last))
+    again.ordering = lambda: keys.ordering([*of_states, *last])
     found = restricted_objective(again, there, factorized(again, there)[0])
     assert found == pytest.approx(settled.steps[-1].objective, abs=1e-2)
 

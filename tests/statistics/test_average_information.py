@@ -7,7 +7,7 @@ import pytest
 from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.problem import Rows
 from factorgraph_dvl.statistics.average_information import SharedRows, restricted_score
-from factorgraph_dvl.statistics.square_root_information import eliminated
+from factorgraph_dvl.statistics.elimination import eliminated
 
 COUNT = 12
 # Variances of the measurements, of the steps of a walk, and of what else errs in a measurement.

@@ -18,12 +18,12 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
+from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.marginal_likelihood import (
     log_determinant_gradient,
     marginal_objective,
     restricted_objective,
 )
-from factorgraph_dvl.statistics.square_root_information import eliminated
 
 CLOCKS = {"gnss": {"time_offset_std_s": 0.05}, "dvl": {"time_offset_std_s": 0.05}}
 CLOCK_OFFSETS = ("gnss_time_offset_s", "time_offset_s")
@@ -48,7 +48,7 @@ def system(name):
 
 def dense(problem, evaluation):
     """Return the Jacobian of states and of constants, and the right-hand side."""
-    order, sizes = problem.ordering(branches=False), evaluation.values.dims()
+    order, sizes = problem.ordering(), evaluation.values.dims()
     jacobian, rhs = problem.linearize(evaluation).jacobian(order)
     count = sum(sizes[problem.key(p.name)] for p in problem.parameters)
     return jacobian[:, :-count], jacobian, rhs
@@ -284,7 +284,7 @@ def test_covariances_given_the_constants_are_those_of_the_dense_matrix():
     states, _, _ = dense(problem, evaluation)
     scale = np.linalg.norm(states, axis=0)
     inverse = np.linalg.inv(np.linalg.qr(states / scale, mode="r")) / scale[:, None]
-    order, sizes = problem.ordering(branches=False), evaluation.values.dims()
+    order, sizes = problem.ordering(), evaluation.values.dims()
     edges = np.cumsum([0, *(sizes[order.at(i)] for i in range(order.size()))])
     place = {order.at(i): slice(edges[i], edges[i + 1]) for i in range(order.size())}
     group = (keys.node(3), keys.bias(0))

@@ -9,9 +9,9 @@ from exactness import worst_relative
 from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
 
+from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_by_source
-from factorgraph_dvl.statistics.square_root_information import eliminated
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])

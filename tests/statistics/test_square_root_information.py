@@ -21,7 +21,7 @@ def test_marginals_are_those_of_the_whole_matrix_however_far_biases_walk(walk):
     information = factorized(problem, evaluation)[0]
     nodes = [keys.node(k) for k in range(problem.chain.segments.node_time.size)]
     found = information.marginals(nodes)
-    order, sizes = problem.ordering(branches=False), evaluation.values.dims()
+    order, sizes = problem.ordering(), evaluation.values.dims()
     jacobian, _ = problem.linearize(evaluation).jacobian(order)
     scale = np.linalg.norm(jacobian, axis=0)
     inverse = np.linalg.inv(np.linalg.qr(jacobian / scale)[1]) / scale[:, None]
