@@ -34,7 +34,7 @@ class Spans:
 
 
 def elimination_order(cuts: Array, every: Iterable[Spans]) -> list[int]:
-    """Return keys of variables in the order of elimination.
+    """Return keys of variables in the order of elimination: of each half before what divides it.
 
     Parameters
     ----------
@@ -50,10 +50,9 @@ def elimination_order(cuts: Array, every: Iterable[Spans]) -> list[int]:
         first = np.searchsorted(cuts, padded[:-2], side="right").tolist()
         last = np.searchsorted(cuts, padded[2:], side="left").tolist()
         for own, before, cut in zip(spans.keys, first, last, strict=True):
-            level = 0
-            if cut > before:
-                # Of numbers in a row, the one that ends with the most zeros.
-                level = (before ^ cut).bit_length()
-                cut = cut >> level - 1 << level - 1
-            items += [(level, cut, number, key) for key in own]
+            # Of numbers in a row, the one that ends with the most zeros divides the trial before
+            # the others; the last of those that it divides.
+            level = (before ^ cut).bit_length()
+            end = cut | (1 << level) - 1 >> 1
+            items += [(end, level, number, key) for key in own]
     return [key for *_, key in sorted(items, key=lambda item: item[:3])]
