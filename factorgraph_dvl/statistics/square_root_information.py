@@ -80,8 +80,38 @@ class _Cliques:
     d: Array
 
 
-# Numbers (M,) of cliques that look alike, components (M, w), and joint covariances (M, w, w).
-_Joint = tuple[IntArray, IntArray, Array]
+@dataclass(frozen=True)
+class _Joint:
+    """Joint covariances of cliques that look alike.
+
+    Parameters
+    ----------
+    numbers : ndarray of int, shape (M,)
+        Numbers of the cliques, ascending.
+    inside : ndarray of int, shape (M, w)
+        Their components among all.
+    P : ndarray, shape (M, w, w)
+        Their covariances.
+    """
+
+    numbers: IntArray
+    inside: IntArray
+    P: Array
+
+    @cached_property
+    def _sorted(self) -> tuple[IntArray, int, IntArray]:
+        """Components of all cliques one after another, ascending, by what; where they stand."""
+        order = np.argsort(self.inside, axis=1)
+        base = int(self.inside.max(initial=0)) + 1
+        lines = np.take_along_axis(self.inside, order, axis=1)
+        return (lines + base * np.arange(len(lines))[:, None]).ravel(), base, order.ravel()
+
+    def of(self, number: IntArray, wanted: IntArray) -> Array:
+        """Return the covariances (B, n, n) of components (B, n), each of one of the cliques."""
+        lines, base, order = self._sorted
+        i = np.searchsorted(self.numbers, number)
+        at = order[np.searchsorted(lines, wanted + base * i[:, None])]
+        return np.asarray(self.P[i[:, None, None], at[:, :, None], at[:, None]])
 
 
 class SquareRootInformation:
@@ -294,15 +324,14 @@ class SquareRootInformation:
             Covariances.
         """
         wanted = [self._by_clique(keys) for keys in parts]
-        for numbers, inside, P in self._joint():
+        for joint in self._joint():
             for part, (own, clique, order) in enumerate(wanted):
-                first = np.searchsorted(clique, numbers)
-                count = np.searchsorted(clique, numbers, side="right") - first
+                first = np.searchsorted(clique, joint.numbers)
+                count = np.searchsorted(clique, joint.numbers, side="right") - first
                 if count.any():
                     behind = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
                     items = np.repeat(first, count) + behind
-                    i = np.repeat(np.arange(numbers.size), count)
-                    yield part, order[items], _among(P, inside, i, own[items])
+                    yield part, order[items], joint.of(clique[items], own[items])
 
     def _by_clique(self, keys: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """Return groups in the order of their cliques: components, cliques, and numbers."""
@@ -321,27 +350,33 @@ class SquareRootInformation:
 
     def _joint(self) -> Iterator[_Joint]:
         """Yield the joint covariances of some cliques that look alike, from the root down."""
+        count = 1 + max((int(each.numbers[-1]) for each in self._cliques), default=-1)
+        is_parent = np.zeros(count, bool)
+        # Which of those above has each clique.
+        place = np.zeros(count, int)
         above: list[_Joint] = []
         for level, below in zip(self._levels, [*self._levels[1:], []], strict=True):
-            parents = np.concatenate([np.zeros(0, int), *(each.parents for each in below)])
+            for each in below:
+                is_parent[each.parents] = True
             here = []
             for each in level:
                 for start in range(0, len(each.R), _AT_ONCE):
-                    some = _joint_of(each, slice(start, start + _AT_ONCE), above)
-                    if np.isin(some[0], parents).any():
-                        here.append(some)
-                    yield some
+                    joint = _joint_of(each, slice(start, start + _AT_ONCE), above, place)
+                    if is_parent[joint.numbers].any():
+                        here.append(joint)
+                    yield joint
             above = here
+            for i, joint in enumerate(above):
+                place[joint.numbers] = i
 
 
-def _joint_of(each: _Cliques, some: slice, above: Sequence[_Joint]) -> _Joint:
+def _joint_of(each: _Cliques, some: slice, above: Sequence[_Joint], place: IntArray) -> _Joint:
     """Return the joint covariances of some cliques from those of their parents.
 
     P_FS = -R⁻¹ T P_SS and P_FF = R⁻¹R⁻ᵀ - P_FS (R⁻¹ T)ᵀ, with P_SS that of the separators.
     """
     R, T, separators = each.R[some], each.T[some], each.separators[some]
     count, f, s = T.shape
-    inside = np.hstack([each.frontals[some], separators])
     identity = np.broadcast_to(np.eye(f), R.shape)
     solved = _upper(R, np.concatenate([identity, T], axis=2))
     inverse, gain = solved[:, :, :f], solved[:, :, f:]
@@ -350,39 +385,16 @@ def _joint_of(each: _Cliques, some: slice, above: Sequence[_Joint]) -> _Joint:
     if s:
         P_SS = P[:, f:, f:]
         parents = each.parents[some]
-        for numbers, of_parent, joint in above:
-            own = np.flatnonzero(np.isin(parents, numbers))
-            if own.size:
-                i = np.searchsorted(numbers, parents[own])
-                P_SS[own] = _among(joint, of_parent, i, separators[own])
+        which = place[parents]
+        for i in np.unique(which).tolist():
+            own = np.flatnonzero(which == i)
+            P_SS[own] = above[i].of(parents[own], separators[own])
         P_FS = -gain @ P_SS
         P_FF = P_FF - P_FS @ gain.transpose(0, 2, 1)
         P[:, :f, f:], P[:, f:, :f] = P_FS, P_FS.transpose(0, 2, 1)
     # An asymmetry would double from one clique to the next where biases walk far.
     P[:, :f, :f] = 0.5 * (P_FF + P_FF.transpose(0, 2, 1))
-    return each.numbers[some], inside, P
-
-
-def _among(P: Array, inside: IntArray, number: IntArray, wanted: IntArray) -> Array:
-    """Return the covariances (B, n, n) of some components of cliques.
-
-    Parameters
-    ----------
-    P : ndarray, shape (M, w, w)
-        Joint covariances of cliques.
-    inside : ndarray of int, shape (M, w)
-        Their components.
-    number : ndarray of int, shape (B,)
-        Which clique has those that are wanted.
-    wanted : ndarray of int, shape (B, n)
-        Components.
-    """
-    order = np.argsort(inside, axis=1)
-    base = int(inside.max(initial=0)) + 1
-    lines = np.take_along_axis(inside, order, axis=1) + base * np.arange(len(inside))[:, None]
-    found = np.searchsorted(lines.ravel(), wanted + base * number[:, None])
-    at = order.ravel()[found]
-    return np.asarray(P[number[:, None, None], at[:, :, None], at[:, None]])
+    return _Joint(each.numbers[some], np.hstack([each.frontals[some], separators]), P)
 
 
 def _without(each: _Cliques, is_known: BoolArray) -> Iterator[_Cliques]:
