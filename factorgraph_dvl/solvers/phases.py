@@ -60,7 +60,7 @@ def phases(
         stamp = log.time[pings] + late
         v_b = log.velocity[pings] @ mounting
         up = rotate(rotation_from_rph(record.rph_at(stamp), record.body_axes), v_b)[:, 2]
-        climbed = cumulative_trapezoid(up, stamp, initial=0.0)
+        climbed = cumulative_trapezoid(up, stamp, initial=0)
         height = np.stack([np.interp(time + shift, stamp, climbed) for shift in shifts])
         climbs = _changes(np.diff(height, axis=0) / TURN_SPAN, _CLIMBING)
         out[climbs, _VERTICAL] = CLIMBS

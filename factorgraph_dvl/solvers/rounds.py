@@ -55,6 +55,8 @@ from factorgraph_dvl.solvers.steps import (
 _SAME_OBJECTIVE, _SAME_CONSTANTS = 0.01, 0.05
 # Steps after which the solver gives up. Measured: most trials take two, the most 30.
 _MOST_STEPS = 200
+# The same of iterations, those in vain included. Measured: half an hour takes up to 60.
+_MOST_ITERATIONS = 300
 
 
 @dataclass(frozen=True)
@@ -131,10 +133,10 @@ def settle(
         freeing = Averaging, KnownParameters, KnownParametersAgain
         steps = [step for step in steps if not isinstance(step, freeing)]
     recorded, changed, going_on = at, "", True
-    while going_on and len(record) < _MOST_STEPS:
+    while going_on and len(record) < _MOST_STEPS and iterations < _MOST_ITERATIONS:
         going_on = False
         for step in steps:
-            found, tried = _kept(step, at, report)
+            found, tried = _kept(step, at, report, _MOST_ITERATIONS - iterations)
             iterations += tried
             if found is None:
                 continue
@@ -153,13 +155,14 @@ def settle(
         *averaging_findings(prepared.parameters, at),
         *explanation_findings(known.estimated_by(at.model), known.left, at.minimum.evaluation),
     )
-    if going_on:
+    if going_on and iterations < _MOST_ITERATIONS:
         text = message("not_converged.steps", count=len(record))
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     minimum = with_all_digits(at)
     at.problem.release()
-    minimum = replace(minimum, converged=minimum.converged and not going_on, iterations=iterations)
-    return SettledMinimum(at.problem, minimum, not going_on, findings, tuple(record))
+    settled = not going_on and iterations < _MOST_ITERATIONS
+    minimum = replace(minimum, converged=minimum.converged and settled, iterations=iterations)
+    return SettledMinimum(at.problem, minimum, settled, findings, tuple(record))
 
 
 def _imu_findings(at: Estimated) -> tuple[Finding, ...]:
@@ -255,10 +258,17 @@ def _strengths_follow(model: Model, before: Model) -> bool:
     )
 
 
-def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None, int]:
-    """Return what a step leads to if the objective is lower there, and the iterations it took."""
+def _kept(
+    step: Step, at: Estimated, report: Progress, most: int = _MOST_ITERATIONS
+) -> tuple[Estimated | None, int]:
+    """Return what a step leads to if the objective is lower there, and the iterations it took.
+
+    Nothing is tried once it took the most that it may.
+    """
     iterations, last, nearer = 0, np.inf, np.inf
-    for proposal in step.proposals(at):
+    for proposal in step.proposals(at) if most > 0 else ():
+        if iterations >= most:
+            break
         # Where less of a change is worse than more of it, none of it is better.
         if (proposal.nearer and nearer > last) or _is_hopeless(proposal, at):
             continue

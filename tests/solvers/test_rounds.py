@@ -107,6 +107,15 @@ def test_steps_without_end_are_named(monkeypatch):
     assert of_code(solution.findings, Code.NOT_CONVERGED)
 
 
+def test_a_solver_that_goes_on_and_on_ends_and_says_so(monkeypatch):
+    monkeypatch.setattr(rounds, "_MOST_ITERATIONS", 1)
+    solution = solve(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1), rate_hz=1.0)
+    assert solution.verdict.grade == "do not use"
+    assert [step.change for step in solution.steps] == ["start"]
+    (finding,) = of_code(solution.findings, Code.NOT_CONVERGED)
+    assert f"in {solution.iterations} iterations" in str(finding)
+
+
 def first_minimum(trial):
     prepared = prepare(trial, 1.0, silent)
     start, _ = rounds._start(
