@@ -55,8 +55,9 @@ from factorgraph_dvl.solvers.steps import (
 _SAME_OBJECTIVE, _SAME_CONSTANTS = 0.01, 0.05
 # Steps after which the solver gives up. Measured: most trials take two, the most 30.
 _MOST_STEPS = 200
-# The same of iterations, those in vain included. Measured: half an hour takes up to 60.
-_MOST_ITERATIONS = 300
+# Iterations in vain after which it does, too: records that contradict each other have no minimum
+# that a few lead to. Measured: half an hour that fits takes up to 60 in all.
+_MOST_IN_VAIN = 200
 
 
 @dataclass(frozen=True)
@@ -132,13 +133,14 @@ def settle(
         # A joint prior knows what was estimated before, and of nothing else.
         freeing = Averaging, KnownParameters, KnownParametersAgain
         steps = [step for step in steps if not isinstance(step, freeing)]
-    recorded, changed, going_on = at, "", True
-    while going_on and len(record) < _MOST_STEPS and iterations < _MOST_ITERATIONS:
+    recorded, changed, going_on, in_vain = at, "", True, 0
+    while going_on and len(record) < _MOST_STEPS and in_vain < _MOST_IN_VAIN:
         going_on = False
         for step in steps:
-            found, tried = _kept(step, at, report, _MOST_ITERATIONS - iterations)
+            found, tried = _kept(step, at, report, _MOST_IN_VAIN - in_vain)
             iterations += tried
             if found is None:
+                in_vain += tried
                 continue
             changed = changed or step.name
             fall, move = recorded.objective - found.objective, found.moved_from(recorded)
@@ -155,12 +157,12 @@ def settle(
         *averaging_findings(prepared.parameters, at),
         *explanation_findings(known.estimated_by(at.model), known.left, at.minimum.evaluation),
     )
-    if going_on and iterations < _MOST_ITERATIONS:
+    if going_on:
         text = message("not_converged.steps", count=len(record))
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     minimum = with_all_digits(at)
     at.problem.release()
-    settled = not going_on and iterations < _MOST_ITERATIONS
+    settled = not going_on and in_vain < _MOST_IN_VAIN
     minimum = replace(minimum, converged=minimum.converged and settled, iterations=iterations)
     return SettledMinimum(at.problem, minimum, settled, findings, tuple(record))
 
@@ -259,14 +261,16 @@ def _strengths_follow(model: Model, before: Model) -> bool:
 
 
 def _kept(
-    step: Step, at: Estimated, report: Progress, most: int = _MOST_ITERATIONS
+    step: Step, at: Estimated, report: Progress, most: int = _MOST_IN_VAIN
 ) -> tuple[Estimated | None, int]:
     """Return what a step leads to if the objective is lower there, and the iterations it took.
 
     Nothing is tried once it took the most that it may.
     """
+    if most <= 0:
+        return None, 0
     iterations, last, nearer = 0, np.inf, np.inf
-    for proposal in step.proposals(at) if most > 0 else ():
+    for proposal in step.proposals(at):
         if iterations >= most:
             break
         # Where less of a change is worse than more of it, none of it is better.
