@@ -20,8 +20,8 @@ PHASES = 4
 _TURNING = 0.4 * DEG
 TURN_SPAN = 10.0
 # Change of the vertical speed, averaged likewise, from which on a vessel begins or ends to climb,
-# m/s. Chosen: above heave in a seaway.
-_CLIMBING = 0.05
+# m/s. Chosen: above heave in a seaway, of which `configs/ship.yaml` leaves 0.08.
+_CLIMBING = 0.1
 # Component of the acceleration that is vertical, of three angular ones and three others.
 _VERTICAL = 5
 
@@ -33,7 +33,7 @@ def phases(
 
     Axes that turn with the average of the heading are behind it where it begins or ends to turn.
     A dive has few climbs, in which the vertical speed changes by much: with one density for all
-    of it, the motion follows the noise of the DVL, which then seems a half of what it is.
+    of it, the motion follows the noise of the DVL, which then seems half of what it is.
 
     Parameters
     ----------
