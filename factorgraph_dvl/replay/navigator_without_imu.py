@@ -217,7 +217,7 @@ class NavigatorWithoutImu(RecordNavigator):
         problem, at = self._problem(
             past,
             time,
-            batch.density(_attitudes(records, float(time[0])), records.log, middle, window.values),
+            batch.density(_attitudes(records, float(time[0])), records, middle, window.values),
             _some(window.evaluation.states, slice(first, window.last + 1)),
             window.values,
             records,

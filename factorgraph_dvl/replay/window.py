@@ -29,7 +29,6 @@ from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.sensors.attitude import Attitude, AttitudeAngles
 from factorgraph_dvl.sensors.carried_point import PointPosition, PointVelocity
-from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.ins import Ins
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
@@ -147,12 +146,12 @@ class BatchSolution:
         )
 
     def density(
-        self, record: AttitudeRecord, log: Dvl | None, time: Array, values: Mapping[str, Array]
+        self, record: AttitudeRecord, records: Trial, time: Array, values: Mapping[str, Array]
     ) -> Array:
         """Return the densities of acceleration at times (M,) by the nodes' clock, (M, 6)."""
         mounting = values.get("misalignment_deg", np.eye(3))
         late = self.late - self.pings_late
-        kinds = phases(record, time + self.late, log, mounting, late)
+        kinds = phases(record, time + self.late, records, mounting, late)
         return np.asarray(np.take_along_axis(self.densities, kinds, axis=0))
 
     def observations(self, aid: Aid) -> list[Observation]:

@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
-from factorgraph_dvl.sensors.dvl import Dvl
+from factorgraph_dvl.trial import Trial
 
 # The heading stays, turns, begins or ends to turn; the vertical speed changes.
 STAYS, TURNS, BEGINS, CLIMBS = range(4)
@@ -27,7 +27,7 @@ _VERTICAL = 5
 
 
 def phases(
-    record: AttitudeRecord, time: Array, log: Dvl | None, mounting: Array, late: float
+    record: AttitudeRecord, time: Array, trial: Trial, mounting: Array, late: float
 ) -> IntArray:
     """Return the phase of each component of the acceleration, (M, 6).
 
@@ -41,12 +41,12 @@ def phases(
         Attitudes.
     time : ndarray, shape (M,), s
         Stamps of the attitude.
-    log : Dvl or None
-        Velocities; without them no climb is known.
+    trial : Trial
+        Whose DVL shows climbs; without one, none is known.
     mounting : ndarray, shape (3, 3)
-        Body to the axes of the log.
+        Body to the axes of the DVL.
     late : float, s
-        Stamps of the attitude less those of the log.
+        Stamps of the attitude less those of the DVL.
     """
     # The average of the heading reaches two spans ahead and behind.
     shifts = TURN_SPAN * np.arange(-2, 3)
@@ -55,6 +55,7 @@ def phases(
     turns = np.abs(rate[1] + rate[2]) > 2.0 * _TURNING
     of_heading = np.where(_changes(rate, _TURNING), BEGINS, np.where(turns, TURNS, STAYS))
     out = np.tile(of_heading[:, None], (1, 6))
+    log = trial.log
     if log is not None and log.locked.sum() > 1:
         pings = np.flatnonzero(log.locked)
         stamp = log.time[pings] + late

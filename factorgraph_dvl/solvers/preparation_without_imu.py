@@ -219,7 +219,7 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     mounting = values.get("misalignment_deg", np.eye(3))
     ping_lag = float(values["time_offset_s"][0]) if trial.log is not None else 0.0
     middle = 0.5 * (nodes[1:] + nodes[:-1]) + late - lag
-    phase = phases(record, middle, trial.log, mounting, late - ping_lag)
+    phase = phases(record, middle, trial, mounting, late - ping_lag)
     early = _early(record, nodes + late - lag)
     states = _states(record, track, frame, nodes - lag, late, early)
     chain = SmoothChain(
@@ -556,7 +556,7 @@ def _densities(
         v_b = log.velocity[rows] @ mounting
         interval = float(np.median(np.diff(time)))
         lag = float(values["time_offset_s"][0])
-        at_pings = phases(record, time + late, log, mounting, late - lag)[:, 3:]
+        at_pings = phases(record, time + late, trial, mounting, late - lag)[:, 3:]
         for kind, i, where in each_phase(phase[:, 3:]):
             spans = _LEG_SPANS if kind == STAYS else (interval, 2.0 * interval)
             own = _density(v_b[:, i], at_pings[:, i] == kind, spans, interval)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from truth import scenario
@@ -41,7 +43,7 @@ def dive():
 
 def test_turns_and_climbs_are_phases_of_their_own(dive):
     trial, record = dive
-    found = phases(record, TIME, trial.log, np.eye(3), 0.0)
+    found = phases(record, TIME, trial, np.eye(3), 0.0)
     of_heading = [STAYS, BEGINS, TURNS, STAYS, STAYS, STAYS, STAYS, STAYS]
     np.testing.assert_array_equal(found[:, :5], np.tile(of_heading, (5, 1)).T)
     vertical = [STAYS, BEGINS, TURNS, STAYS, CLIMBS, STAYS, CLIMBS, STAYS]
@@ -49,13 +51,14 @@ def test_turns_and_climbs_are_phases_of_their_own(dive):
 
 
 def test_without_a_log_no_climb_is_known(dive):
-    _, record = dive
-    assert not np.any(phases(record, TIME, None, np.eye(3), 0.0) == CLIMBS)
+    trial, record = dive
+    found = phases(record, TIME, replace(trial, dvl=None), np.eye(3), 0.0)
+    assert not np.any(found == CLIMBS)
 
 
 def test_every_step_has_one_phase_of_each_component(dive):
     trial, record = dive
-    found = phases(record, TIME, trial.log, np.eye(3), 0.0)
+    found = phases(record, TIME, trial, np.eye(3), 0.0)
     count = np.zeros_like(found)
     for kind, i, where in each_phase(found):
         assert np.all(found[where, i] == kind)
