@@ -57,7 +57,7 @@ _SAME_OBJECTIVE, _SAME_CONSTANTS = 0.01, 0.05
 _MOST_STEPS = 200
 # Iterations in vain after which it does, too: records that contradict each other have no minimum
 # that a few lead to. Measured: half an hour that fits takes up to 60 in all.
-_MOST_IN_VAIN = 200
+_MOST_IN_VAIN = 100
 
 
 @dataclass(frozen=True)

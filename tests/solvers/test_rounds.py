@@ -116,7 +116,7 @@ def test_a_solver_that_tries_much_in_vain_ends_and_says_so(monkeypatch):
 
     monkeypatch.setattr(rounds, "_kept", in_vain)
     solution = solve(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1), rate_hz=1.0)
-    assert left[:3] == [200, 50, -100]
+    assert left[:3] == [100, -50, -200]
     assert solution.verdict.grade == "do not use"
     (finding,) = of_code(solution.findings, Code.NOT_CONVERGED)
     assert f"in {solution.iterations} iterations" in str(finding)
