@@ -56,7 +56,7 @@ _SAME_OBJECTIVE, _SAME_CONSTANTS = 0.01, 0.05
 # Steps after which the solver gives up. Measured: most trials take two, the most 30.
 _MOST_STEPS = 200
 # Iterations in vain after which it does, too: records that contradict each other have no minimum
-# that a few lead to. Measured: half an hour that fits takes up to 60 in all.
+# that a few lead to. Measured: trials that fit take up to 90 in all.
 _MOST_IN_VAIN = 100
 
 
