@@ -225,7 +225,7 @@ def _checked(
     """Return what the calibration does to the DVL's residuals and to dead reckoning.
 
     The calibration of the first half is used with the data of the second. Where the first half
-    gives none to be used, the data are those that the calibration is from.
+    gives none to be used, or the trial itself, the data are those that the calibration is from.
     """
     from factorgraph_dvl.analysis.comparison.halves import halves_of
     from factorgraph_dvl.analysis.dead_reckoning.check import Data, check_calibration
@@ -242,8 +242,9 @@ def _checked(
     candidates: list[tuple[Trial, Solution, Data]] = [(trial, solution, "same data")]
     with suppress(FactorgraphDvlError):
         start, rest = halves_of(trial)
-        first = first or run_batch(start, anyway=True, progress=half)
-        if first.verdict.grade != "do not use":
+        if solution.verdict.grade != "do not use":
+            first = first or run_batch(start, anyway=True, progress=half)
+        if first is not None and first.verdict.grade != "do not use":
             candidates.insert(0, (rest, first, "second half"))
     for part, found, data in candidates:
         with suppress(FactorgraphDvlError):

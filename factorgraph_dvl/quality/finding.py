@@ -168,6 +168,7 @@ UNUSABLE = frozenset(
         Code.ZERO_FIXES,
         Code.RADIANS,
         Code.NO_EPOCH,
+        Code.BEACON_RANGES,
         Code.USBL_AXES,
     }
 )

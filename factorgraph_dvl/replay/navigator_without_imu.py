@@ -29,9 +29,9 @@ from factorgraph_dvl.replay.window import (
 from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.sensors.records import rows_of
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.phases import TURN_SPAN
 from factorgraph_dvl.solvers.preparation_without_imu import (
     LONGEST,
-    TURN_SPAN,
     WAVES,
     prepare_without_imu,
     track_axes,
@@ -217,7 +217,7 @@ class NavigatorWithoutImu(RecordNavigator):
         problem, at = self._problem(
             past,
             time,
-            batch.density(_attitudes(records, float(time[0])), middle),
+            batch.density(_attitudes(records, float(time[0])), records, middle, window.values),
             _some(window.evaluation.states, slice(first, window.last + 1)),
             window.values,
             records,

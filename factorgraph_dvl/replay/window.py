@@ -34,12 +34,12 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid, Observation
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.phases import PHASES, phases
 from factorgraph_dvl.solvers.posterior import Posterior, posterior
 from factorgraph_dvl.solvers.preparation_without_imu import (
     PreparationWithoutImu,
     lasting_observations,
     node_clock,
-    phases,
 )
 from factorgraph_dvl.solvers.true_times import (
     covariances_at_true_times,
@@ -79,12 +79,11 @@ class BatchSolution:
     noise : tuple of Noise
         The same, as it is reported.
     late : float, s
-        Stamps of the attitude less times of the nodes where it started: phases of turns are by
-        these.
+        Stamps of the attitude less times of the nodes where it started: phases are by these.
     pings_late : float, s
         Stamps of pings less times of the nodes; zero where nodes have the clock of the pings.
-    densities : ndarray, shape (3, 6)
-        Densities of acceleration, by what the heading does: it stays, turns, or begins or ends to.
+    densities : ndarray, shape (4, 6)
+        Densities of acceleration in each phase.
     tilt : ndarray, shape (P,), 1/s
         Gradient of the states' volume that every second adds.
     std : dict of str to ndarray
@@ -147,9 +146,14 @@ class BatchSolution:
             labels={aid.section: {o.label for o in every} for aid, every in by_aid},
         )
 
-    def density(self, record: AttitudeRecord, time: Array) -> Array:
+    def density(
+        self, record: AttitudeRecord, records: Trial, time: Array, values: Mapping[str, Array]
+    ) -> Array:
         """Return the densities of acceleration at times (M,) by the nodes' clock, (M, 6)."""
-        return np.asarray(self.densities[phases(record, time + self.late)])
+        mounting = values.get("misalignment_deg", np.eye(3))
+        late = self.late - self.pings_late
+        kinds = phases(record, time + self.late, records, mounting, late)
+        return np.asarray(np.take_along_axis(self.densities, kinds, axis=0))
 
     def observations(self, aid: Aid) -> list[Observation]:
         """Return what some rows of a sensor measured, with the noise of the whole record."""
@@ -165,21 +169,18 @@ class BatchSolution:
 
 
 def _densities(density: Array, phase: IntArray) -> Array:
-    """Return the density (3, 6) of each phase from those of steps, (K - 1, 6) and (K - 1,).
+    """Return the density (4, 6) of each phase from those of steps, and phases, (K - 1, 6).
 
-    Where the vessel has not turned yet, another strength is assumed for that.
+    Where the vessel has not turned or climbed yet, another strength is assumed for that.
     """
-    out: list[Array] = []
-    for kind in range(3):
-        own = density[phase == kind]
-        if own.size:
-            out.append(own[0])
-        elif out:
-            out.append(np.maximum(out[-1], np.repeat([0.0, _FIRST_TURNS], 3)))
-        else:
-            # It has turned from the beginning.
-            out.append(density[np.argmin(phase)])
-    return np.array(out)
+    # It may have turned from the beginning.
+    out = np.tile(np.take_along_axis(density, np.argmin(phase, axis=0)[None], axis=0), (PHASES, 1))
+    for kind in range(PHASES):
+        own = phase == kind
+        first = np.take_along_axis(density, np.argmax(own, axis=0)[None], axis=0)[0]
+        before = np.maximum(out[max(kind - 1, 0)], np.repeat([0.0, _FIRST_TURNS], 3))
+        out[kind] = np.where(own.any(axis=0), first, before if kind else out[kind])
+    return out
 
 
 def _typical(std: Array) -> Array:

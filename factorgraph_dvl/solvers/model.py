@@ -215,7 +215,7 @@ def minimised(
     """Return a model at its minimum, its problem and the minimum.
 
     Gravity and weights are those of the model, so that the objective compares with that of others;
-    where the minimum is far from where they were taken, they are taken there.
+    where the minimum is far from where they were taken, they are taken there, if it is one.
 
     Parameters
     ----------
@@ -256,7 +256,7 @@ def minimised(
         moved = float(np.sqrt(np.mean((states.p_n - model.track) ** 2)))
         heavier = not model.chain.interpolates and moved > _SAME_GRAVITY
         lighter = problem.needs_reweighting(minimum.evaluation)
-        if not (heavier or lighter):
+        if not (minimum.converged and (heavier or lighter)):
             break
         last, problem = problem, None
         if heavier:

@@ -15,6 +15,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.graph.smooth_motion import SmoothStates
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.phases import each_phase
 from factorgraph_dvl.statistics.average_information import (
     RestrictedScore,
     SharedRows,
@@ -95,8 +96,8 @@ def motion_strengths(
         Problem of a chain without IMU.
     minimum : Minimum
         Where it ended.
-    phase : ndarray of int, shape (K - 1,)
-        What the heading does: accelerations have densities of their own in each phase.
+    phase : ndarray of int, shape (K - 1, 6)
+        Phases of the accelerations, which have densities of their own in each.
     least_gain : float, optional
         Fall of -2 log of the likelihood by one strength from which on another estimate follows.
     """
@@ -110,14 +111,15 @@ def motion_strengths(
     factors = {label: factor.copy() for label, factor in problem.noise_factors.items()}
     density = chain.density.copy()
     sigma = {process.name: process.sigma.copy() for process in problem.processes}
-    kinds = {f"{chain.step_source} {kind}": phase == kind for kind in np.unique(phase).tolist()}
+    places = {(f"{chain.step_source} {kind}", i): where for kind, i, where in each_phase(phase)}
     for i, s in enumerate(strengths):
         own = list(s.components)
-        if s.name in kinds:
+        if (s.name, own[0]) in places:
             (component,) = s.components
-            before = density[kinds[s.name], component][0]
+            where = places[s.name, component]
+            before = density[where, component][0]
             after = float(np.clip(before * np.exp(wanted[i]), _LEAST[component], _MOST[component]))
-            density[kinds[s.name], component] = after
+            density[where, component] = after
             # At a bound, what is asked for beyond it changes nothing.
             wanted[i] = np.log(after / before)
         elif s.name in factors:
@@ -270,8 +272,8 @@ def _strengths_of(problem: Problem, phase: IntArray) -> list[_Strength]:
     for label, factors in problem.noise_factors.items():
         for group in groups[label]:
             out.append(_Strength(label, group, 1.0 / float(factors[group[0]]) ** 2))
-    for kind in np.unique(phase).tolist():
-        out += [_Strength(f"{problem.chain.step_source} {kind}", (i,)) for i in range(6)]
+    for kind, i, _ in each_phase(phase):
+        out.append(_Strength(f"{problem.chain.step_source} {kind}", (i,)))
     for process in problem.processes:
         if process.density_only or not (process.label in problem.noise_factors or process.free):
             continue
@@ -291,12 +293,12 @@ def _rows_of(
     for rows in rows_by_source(problem, evaluation):
         d = rows.vector.shape[1]
         if rows.source == problem.chain.step_source:
-            kinds = phase[rows.begin : rows.begin + len(rows.vector)]
-            table = {
-                kind: [number[f"{rows.source} {kind}", i % 6] for i in range(d)]
-                for kind in np.unique(kinds).tolist()
-            }
-            yield rows, np.array([table[kind] for kind in kinds.tolist()]), np.ones(d)
+            own_phase = phase[rows.begin : rows.begin + len(rows.vector)]
+            numbers = np.empty_like(own_phase)
+            for kind, i, where in each_phase(own_phase):
+                numbers[where, i] = number[f"{rows.source} {kind}", i]
+            # Turn and shift, then what rates change by.
+            yield rows, np.tile(numbers, (1, d // 6)), np.ones(d)
             continue
         name = processes.get(rows.source, rows.source)
         each = np.array([number.get((name, i), -1) for i in range(d)])

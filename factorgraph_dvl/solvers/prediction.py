@@ -35,6 +35,7 @@ from factorgraph_dvl.solvers.information_along_trial import (
     run_filter,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.phases import each_phase
 from factorgraph_dvl.solvers.preparation_without_imu import LEAST_DENSITY, prepare_without_imu
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL, dense_epochs
 from factorgraph_dvl.solvers.summary import summarise
@@ -209,7 +210,7 @@ def _true_values(trial: Trial, parameters: Sequence[Parameter]) -> dict[str, Arr
 
 
 def as_moving(chain: SmoothChain, states: SmoothStates, phase: IntArray) -> SmoothChain:
-    """Return a chain with the densities that its states have, by what the heading does.
+    """Return a chain with the densities that its states have, by phase.
 
     Those that the preparation takes from records without noise are those of the sway, which turns
     the velocity of a log but not that of the track.
@@ -217,9 +218,8 @@ def as_moving(chain: SmoothChain, states: SmoothStates, phase: IntArray) -> Smoo
     own = chain.states(chain.values(states))
     squares = np.concatenate([step.residual for step in chain.steps(own)]) ** 2
     density = chain.density.copy()
-    for kind in np.unique(phase):
-        where = phase == kind
-        density[where] *= 0.5 * (squares[where, :6] + squares[where, 6:]).mean(axis=0)
+    for _, i, where in each_phase(phase):
+        density[where, i] *= 0.5 * (squares[where, i] + squares[where, 6 + i]).mean()
     return replace(chain, density=np.maximum(density, LEAST_DENSITY))
 
 

@@ -11,7 +11,6 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import BodyAxes, rotation_from_rph
-from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, spread
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.priors import Tilt, prior_mean
@@ -42,6 +41,7 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths, motion_strengths
+from factorgraph_dvl.solvers.phases import STAYS, each_phase, phases
 from factorgraph_dvl.solvers.position_from_ranges import StartPositions
 from factorgraph_dvl.solvers.preparation import MountedStart
 from factorgraph_dvl.trial import Trial
@@ -49,9 +49,6 @@ from factorgraph_dvl.trial import Trial
 CURRENT = "current"
 # Sensors that ask more of the motion than a motion prior gives.
 _NEED_IMU = frozenset({"star", "turntable"})
-# Turn rate, averaged over seconds, from which on a vessel turns. Chosen: above yaw in a seaway.
-_TURNING = 0.4 * DEG
-TURN_SPAN = 10.0
 # Span, s, over which the heading of the track is averaged, and interval of its samples. Chosen:
 # waves that move a ship are shorter, its turns longer.
 WAVES, _GRID = 20.0, 0.5
@@ -101,8 +98,8 @@ class PreparationWithoutImu:
         Whose heading the track follows.
     values : dict of str to ndarray
         Values of clocks and mountings.
-    phase : ndarray of int, shape (K - 1,)
-        What the heading does between nodes: 0 = stays, 1 = turns, 2 = begins or ends to turn.
+    phase : ndarray of int, shape (K - 1, 6)
+        What heading and vertical speed do between nodes, for each acceleration.
     observations : tuple of Observation
         Measurements of all sensors.
     parameters : tuple of Parameter
@@ -219,7 +216,10 @@ def prepare_without_imu(trial: Trial) -> PreparationWithoutImu:
     late = float(values[record.sensor.clock.offset.name][0])
     lag = float(values[clock][0])
     nodes = _nodes(trial, record, track, late=late, lag=lag)
-    phase = phases(record, 0.5 * (nodes[1:] + nodes[:-1]) + late - lag)
+    mounting = values.get("misalignment_deg", np.eye(3))
+    ping_lag = float(values["time_offset_s"][0]) if trial.log is not None else 0.0
+    middle = 0.5 * (nodes[1:] + nodes[:-1]) + late - lag
+    phase = phases(record, middle, trial, mounting, late - ping_lag)
     early = _early(record, nodes + late - lag)
     states = _states(record, track, frame, nodes - lag, late, early)
     chain = SmoothChain(
@@ -530,21 +530,6 @@ def _nodes(
     return without_long_steps(np.concatenate([before, kept, after]), longest)
 
 
-def phases(record: AttitudeRecord, time: Array) -> IntArray:
-    """Return what the heading does about stamps (M,) of the attitude, averaged over seconds.
-
-    It stays (0), turns at a rate (1), or begins or ends to turn (2): axes that turn with its
-    average are behind it then.
-    """
-    # The average of the heading reaches two spans ahead and behind.
-    shifts = TURN_SPAN * np.arange(-2, 3)
-    heading = np.stack([record.rph_at(time + shift)[:, 2] for shift in shifts])
-    rate = np.diff(heading, axis=0) / TURN_SPAN
-    changes = np.any(np.abs(np.diff(rate, axis=0)) > _TURNING, axis=0)
-    turns = np.abs(rate[1] + rate[2]) > 2.0 * _TURNING
-    return np.where(changes, 2, turns.astype(int))
-
-
 def _densities(
     trial: Trial,
     record: AttitudeRecord,
@@ -554,39 +539,41 @@ def _densities(
     phase: IntArray,
     late: float,
 ) -> Array:
-    """Return densities of acceleration to start from, (K - 1, 6), by what the heading does.
+    """Return densities of acceleration to start from, (K - 1, 6), by phase.
 
     Velocities that are L apart differ by the density times L and by twice the noise: from two L
     both follow. Rates are those of the record.
     """
     out = np.tile(np.repeat([0.0, _DENSITY], 3), (nodes.size - 1, 1))
     step, change = np.diff(nodes)[:, None], np.diff(states.omega_b, axis=0)
-    for kind in np.unique(phase):
-        where = phase == kind
-        out[where, :3] = np.mean((change**2 / step)[where], axis=0)
+    for _, i, where in each_phase(phase[:, :3]):
+        out[where, i] = np.mean((change**2 / step)[where, i])
     log = trial.log
     if log is not None and log.locked.sum() >= 50:
         rows = np.flatnonzero(log.locked)
         time = log.time[rows] - float(values["time_offset_s"][0])
-        v_b = log.velocity[rows] @ values.get("misalignment_deg", np.eye(3))
+        mounting = values.get("misalignment_deg", np.eye(3))
+        v_b = log.velocity[rows] @ mounting
         interval = float(np.median(np.diff(time)))
-        at_pings = phases(record, time + late)
-        for kind in np.unique(phase):
-            spans = (interval, 2.0 * interval) if kind else _LEG_SPANS
-            out[phase == kind, 3:] = _density(v_b, at_pings == kind, spans, interval)
+        lag = float(values["time_offset_s"][0])
+        at_pings = phases(record, time + late, trial, mounting, late - lag)[:, 3:]
+        for kind, i, where in each_phase(phase[:, 3:]):
+            spans = _LEG_SPANS if kind == STAYS else (interval, 2.0 * interval)
+            own = _density(v_b[:, i], at_pings[:, i] == kind, spans, interval)
+            out[where, 3 + i] = own
     return np.maximum(out, LEAST_DENSITY)
 
 
-def _density(v_b: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> Array:
-    """Return the density (3,) of what changes velocities (M, 3) over two spans, s."""
+def _density(v: Array, wanted: BoolArray, spans: tuple[float, float], interval: float) -> float:
+    """Return the density of what changes a component (M,) of velocity over two spans, s."""
     squares = []
     for span in spans:
-        step = min(max(1, round(span / interval)), len(v_b) - 1)
+        step = min(max(1, round(span / interval)), len(v) - 1)
         alike = wanted[step:] & wanted[:-step]
         if step < round(span / interval) or alike.sum() < 20:
-            return np.full(3, _DENSITY)
-        squares.append(np.mean((v_b[step:] - v_b[:-step])[alike] ** 2, axis=0))
-    return np.asarray(np.maximum(squares[1] / spans[1], 1e-6))
+            return _DENSITY
+        squares.append(float(np.mean((v[step:] - v[:-step])[alike] ** 2)))
+    return max(squares[1] / spans[1], 1e-6)
 
 
 def _notes(trial: Trial) -> tuple[Finding, ...]:

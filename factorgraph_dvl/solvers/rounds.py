@@ -55,6 +55,9 @@ from factorgraph_dvl.solvers.steps import (
 _SAME_OBJECTIVE, _SAME_CONSTANTS = 0.01, 0.05
 # Steps after which the solver gives up. Measured: most trials take two, the most 30.
 _MOST_STEPS = 200
+# Iterations in vain after which it does, too: records that contradict each other have no minimum
+# that a few lead to. Measured: trials that fit take up to 90 in all.
+_MOST_IN_VAIN = 100
 
 
 @dataclass(frozen=True)
@@ -130,13 +133,14 @@ def settle(
         # A joint prior knows what was estimated before, and of nothing else.
         freeing = Averaging, KnownParameters, KnownParametersAgain
         steps = [step for step in steps if not isinstance(step, freeing)]
-    recorded, changed, going_on = at, "", True
-    while going_on and len(record) < _MOST_STEPS:
+    recorded, changed, going_on, in_vain = at, "", True, 0
+    while going_on and len(record) < _MOST_STEPS and in_vain < _MOST_IN_VAIN:
         going_on = False
         for step in steps:
-            found, tried = _kept(step, at, report)
+            found, tried = _kept(step, at, report, _MOST_IN_VAIN - in_vain)
             iterations += tried
             if found is None:
+                in_vain += tried
                 continue
             changed = changed or step.name
             fall, move = recorded.objective - found.objective, found.moved_from(recorded)
@@ -158,8 +162,9 @@ def settle(
         findings += (Finding(Code.NOT_CONVERGED, text, severity="error"),)
     minimum = with_all_digits(at)
     at.problem.release()
-    minimum = replace(minimum, converged=minimum.converged and not going_on, iterations=iterations)
-    return SettledMinimum(at.problem, minimum, not going_on, findings, tuple(record))
+    settled = not going_on and in_vain < _MOST_IN_VAIN
+    minimum = replace(minimum, converged=minimum.converged and settled, iterations=iterations)
+    return SettledMinimum(at.problem, minimum, settled, findings, tuple(record))
 
 
 def _imu_findings(at: Estimated) -> tuple[Finding, ...]:
@@ -255,10 +260,19 @@ def _strengths_follow(model: Model, before: Model) -> bool:
     )
 
 
-def _kept(step: Step, at: Estimated, report: Progress) -> tuple[Estimated | None, int]:
-    """Return what a step leads to if the objective is lower there, and the iterations it took."""
+def _kept(
+    step: Step, at: Estimated, report: Progress, most: int = _MOST_IN_VAIN
+) -> tuple[Estimated | None, int]:
+    """Return what a step leads to if the objective is lower there, and the iterations it took.
+
+    Nothing is tried once it took the most that it may.
+    """
+    if most <= 0:
+        return None, 0
     iterations, last, nearer = 0, np.inf, np.inf
     for proposal in step.proposals(at):
+        if iterations >= most:
+            break
         # Where less of a change is worse than more of it, none of it is better.
         if (proposal.nearer and nearer > last) or _is_hopeless(proposal, at):
             continue

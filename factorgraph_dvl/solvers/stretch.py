@@ -12,6 +12,7 @@ import numpy as np
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.solution import Progress
+from factorgraph_dvl.solvers.phases import STAYS, each_phase
 from factorgraph_dvl.solvers.preparation_without_imu import (
     PreparationWithoutImu,
     prepare_without_imu,
@@ -41,7 +42,7 @@ def started_from_stretch(
     time = prepared.first_chain.node_time
     if time[-1] - time[0] < _WORTH_IT * _LENGTH:
         return prepared
-    turns = np.concatenate([[0], np.cumsum(prepared.phase > 0)])
+    turns = np.concatenate([[0], np.cumsum(np.any(prepared.phase != STAYS, axis=1))])
     last = np.searchsorted(time, time + _LENGTH)
     inside = np.flatnonzero(last < time.size)
     first = int(inside[np.argmax(turns[last[inside]] - turns[inside])])
@@ -59,8 +60,8 @@ def started_from_stretch(
     chain, found = prepared.first_chain, settled.problem
     assert isinstance(found.chain, SmoothChain)
     density = chain.density.copy()
-    for kind in np.intersect1d(part.phase, prepared.phase):
-        density[prepared.phase == kind] = found.chain.density[part.phase == kind][0]
+    for kind, i, where in each_phase(part.phase):
+        density[prepared.phase[:, i] == kind, i] = found.chain.density[where, i][0]
     values = settled.minimum.evaluation.parameters
     strengths = {process.name: process.sigma for process in found.processes}
     longer = (time[-1] - time[0]) / (time[last[first]] - time[first])

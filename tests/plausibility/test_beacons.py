@@ -9,6 +9,8 @@ import pytest
 from truth import config
 
 import factorgraph_dvl as fd
+from factorgraph_dvl.errors import DataError
+from factorgraph_dvl.plausibility.survey import accepted_errors
 from factorgraph_dvl.quality.finding import Code
 
 
@@ -17,11 +19,15 @@ def trial():
     return fd.simulate(config("dive-lbl", imu={"rate_hz": 20}), seed=1)
 
 
-def found(trial, **changes):
+def changed(trial, **changes):
     beacons = replace(trial.beacons, **changes)
     others = tuple(beacons if a is trial.beacons else a for a in trial.others)
-    changed = replace(trial, others=others)
-    return [f for f in fd.survey(changed).findings if f.code == Code.BEACON_RANGES]
+    return replace(trial, others=others)
+
+
+def found(trial, **changes):
+    findings = fd.survey(changed(trial, **changes)).findings
+    return [f for f in findings if f.code == Code.BEACON_RANGES]
 
 
 def renamed(trial, **names):
@@ -60,6 +66,23 @@ def test_a_beacon_far_from_its_place_is_a_warning(trial):
     (finding,) = found(trial, range=trial.beacons.range + longer)
     assert finding.severity == "warning"
     assert "ranges to T3" in str(finding)
+
+
+@pytest.mark.parametrize(
+    ("swapped", "factor", "says"),
+    [
+        ({"T1": "T2", "T2": "T1"}, 1.0, "they are those to T2"),
+        ({}, 1.5, "is a travel time in ms"),
+    ],
+)
+def test_a_mistake_is_refused_with_its_reason(trial, swapped, factor, says):
+    beacons = trial.beacons
+    spoilt = changed(trial, name=renamed(trial, **swapped), range=beacons.range / factor)
+    with pytest.raises(DataError, match=says) as refused:
+        fd.solve(spoilt)
+    assert "--anyway" in str(refused.value)
+    accepted = accepted_errors(fd.survey(spoilt), anyway=True)
+    assert any(says in str(error) for error in accepted)
 
 
 def test_without_fixes_nothing_is_compared(trial):

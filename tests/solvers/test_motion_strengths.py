@@ -78,7 +78,7 @@ def test_a_density_at_its_bound_changes_no_more(settled, monkeypatch, at_bound):
     monkeypatch.setattr(motion_strengths, "_step", less)
     if at_bound:
         monkeypatch.setattr(motion_strengths, "_LEAST", density[0])
-    phase = np.zeros(len(density), dtype=int)
+    phase = np.zeros((len(density), 6), dtype=int)
     found = motion_strengths.motion_strengths(problem, settled.minimum, phase)
     assert found.same == at_bound
     assert np.array_equal(found.chain.density[0], density[0]) == at_bound

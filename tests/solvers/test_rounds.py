@@ -112,6 +112,21 @@ def test_steps_without_end_are_named(monkeypatch):
     assert of_code(solution.findings, Code.NOT_CONVERGED)
 
 
+def test_a_solver_that_tries_much_in_vain_ends_and_says_so(monkeypatch):
+    left = []
+
+    def in_vain(step, at, report, most):
+        left.append(most)
+        return None, 150
+
+    monkeypatch.setattr(rounds, "_kept", in_vain)
+    solution = solve(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1), rate_hz=1.0)
+    assert left[:3] == [100, -50, -200]
+    assert solution.verdict.grade == "do not use"
+    (finding,) = of_code(solution.findings, Code.NOT_CONVERGED)
+    assert f"in {solution.iterations} iterations" in str(finding)
+
+
 def first_minimum(trial):
     prepared = prepare(trial, 1.0, silent)
     start, _ = rounds._start(
@@ -130,6 +145,16 @@ def test_noise_that_no_fit_makes_up_for_is_not_tried():
     least = least_objective(model, at.states, at.values)
     # What it leaves out: the squares of all residuals.
     assert least + 2.0 * at.minimum.evaluation.cost == pytest.approx(at.objective, abs=1.0)
+
+
+def test_nothing_is_tried_beyond_the_most_in_vain():
+    class Costly:
+        name = "costly"
+
+        def proposals(self, at):
+            raise AssertionError
+
+    assert rounds._kept(Costly(), None, silent, 0) == (None, 0)
 
 
 def test_less_of_what_makes_it_worse_is_not_tried(monkeypatch):
