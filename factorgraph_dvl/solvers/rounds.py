@@ -147,7 +147,11 @@ def settle(
             going_on = found.rough or fall > _SAME_OBJECTIVE or move > _SAME_CONSTANTS
             at = found
             if not found.rough:
-                record.append(SolverStep(changed, found.objective, fall, move))
+                if recorded.rough and changed == States.name:
+                    # What began roughly begins where its minimum is.
+                    record[-1] = replace(record[-1], objective=found.objective)
+                else:
+                    record.append(SolverStep(changed, found.objective, fall, move))
                 recorded, changed = found, ""
             if going_on:
                 break
