@@ -6,10 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.ndimage import median_filter
 
 from factorgraph_dvl.geometry.rotations import rotation_from_rph
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, spread
 from factorgraph_dvl.imu.attitude_record import AttitudeRecord
 from factorgraph_dvl.trial import Trial
 
@@ -22,6 +23,9 @@ TURN_SPAN = 10.0
 # Change of the vertical speed, averaged likewise, from which on a vessel begins or ends to climb,
 # m/s. Chosen: above heave in a seaway, of which `configs/ship.yaml` leaves 0.08.
 _CLIMBING = 0.1
+# Pings that a wrong one is judged by, and deviations from their median from which on it is one.
+# Chosen: two in a row may be wrong.
+_NEIGHBOURS, _WRONG = 5, 5.0
 # Component of the acceleration that is vertical, of three angular ones and three others.
 _VERTICAL = 5
 
@@ -61,6 +65,9 @@ def phases(
         stamp = log.time[pings] + late
         v_b = log.velocity[pings] @ mounting
         up = rotate(rotation_from_rph(record.rph_at(stamp), record.body_axes), v_b)[:, 2]
+        # A wrong ping is no climb.
+        near = median_filter(up, _NEIGHBOURS)
+        up = np.where(np.abs(up - near) > _WRONG * spread(up - near), near, up)
         climbed = cumulative_trapezoid(up, stamp, initial=0)
         height = np.stack([np.interp(time + shift, stamp, climbed) for shift in shifts])
         climbs = _changes(np.diff(height, axis=0) / TURN_SPAN, _CLIMBING)

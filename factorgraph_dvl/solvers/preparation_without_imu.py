@@ -164,17 +164,25 @@ class PreparationWithoutImu:
     def strengths(self, problem: Problem, minimum: Minimum) -> Strengths:
         """Return the strengths of motion and noise that residuals ask for."""
         found = motion_strengths(problem, minimum, self.phase, self.least_gain)
-        chain, values = found.chain, minimum.evaluation.parameters
+        chain, states = self.laid_by(minimum.evaluation.parameters, found.chain, found.states)
+        return replace(found, chain=chain, states=states)
+
+    def laid_by(
+        self, values: Mapping[str, Array], chain: SmoothChain, states: SmoothStates
+    ) -> tuple[SmoothChain, SmoothStates]:
+        """Return a chain and its states, with attitudes where these clocks ask for them.
+
+        Both are as they were where the clocks ask for about the same.
+        """
         interval = float(np.median(np.diff(chain.node_time)))
         shift = chain.shift(values) - _EARLY * interval
         moved = abs(shift - chain.attitude_shift)
         if _sparse(self.record, interval) or moved < _MOVED * interval:
-            return found
+            return chain, states
         lag = 0.0 if chain.clock is None else float(values[chain.clock][0])
         late = float(values[self.record.sensor.clock.offset.name][0])
         axes = track_axes(self.record, chain.frame, self.states, chain.node_time - lag, late)
-        chain, states = _anew(replace(chain, nRt=axes), minimum.evaluation.states, shift)
-        return replace(found, chain=chain, states=states)
+        return _anew(replace(chain, nRt=axes), chain.states(chain.values(states)), shift)
 
     def start(self, chain: Chain, states: SmoothStates, report: Progress) -> MountedStart:
         """Return where the minimisation starts: motion and mountings are known by the records."""

@@ -63,6 +63,9 @@ def started_from_stretch(
     for kind, i, where in each_phase(part.phase):
         density[prepared.phase[:, i] == kind, i] = found.chain.density[where, i][0]
     values = settled.minimum.evaluation.parameters
+    # Chains that are laid otherwise have objectives that do not compare: it is laid once.
+    own = prepared.values | {p.name: values[p.name] for p in prepared.parameters}
+    chain, states = prepared.laid_by(own, replace(chain, density=density), prepared.states)
     strengths = {process.name: process.sigma for process in found.processes}
     longer = (time[-1] - time[0]) / (time[last[first]] - time[first])
     tilt = found.tilt
@@ -72,8 +75,9 @@ def started_from_stretch(
         tilt = replace(tilt, gradient=longer * tilt.gradient, origin=values, hold=None)
     return replace(
         prepared,
-        first_chain=replace(chain, density=density),
-        values=prepared.values | {p.name: values[p.name] for p in prepared.parameters},
+        first_chain=chain,
+        states=states,
+        values=own,
         processes=tuple(
             replace(p, sigma=strengths.get(p.name, p.sigma)) for p in prepared.processes
         ),

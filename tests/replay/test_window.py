@@ -195,7 +195,8 @@ def test_a_few_rows_have_the_noise_of_the_record(ship, whole, batch):
 @OVER_GROUND
 def test_densities_are_those_of_turns_where_the_vessel_turns(ship, batch):
     record = AttitudeRecord(ship.attitude, ship.body_axes, estimated=False)
-    density = batch.density(record, np.array([20.0, 43.0, 65.0]))
+    time = np.array([20.0, 43.0, 65.0])
+    density = batch.density(record, ship, time, {})
     # The averages that axes of the track follow reach over the whole of this turn.
     np.testing.assert_array_equal(density, batch.densities[[0, 2, 2]])
     assert np.any(batch.densities[0] != batch.densities[2])
