@@ -61,6 +61,7 @@ def test_types_may_be_used_first_in_several_threads_many_times(trials):
     check_first_use(trials / "imu", 40)
 
 
+@pytest.mark.slow
 def test_two_threads_solve_two_trials_as_one_does(trials):
     pair = trials / "imu", trials / "beacon"
     assert output_of("solve", "together", *pair) == output_of("solve", "apart", *pair)

@@ -120,6 +120,7 @@ def test_each_measurement_is_compared_with_its_prediction_once(trial, played):
     assert heard / 3 < ranges[0].size < heard
 
 
+@pytest.mark.slow
 def test_what_comes_later_changes_nothing(trial, played):
     _, whole = played
     _, early = replay(trial.until(110.0), rate_hz=0.2)
@@ -128,6 +129,7 @@ def test_what_comes_later_changes_nothing(trial, played):
     np.testing.assert_allclose(early.values[same], whole.values[same], rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_ranges_that_come_late_and_out_of_order_count_as_if_in_time(trial, played):
     """However late: no state is left behind."""
     session, updates = fed(trial, 120.0, 5.0, late={"beacons": 8.0})
@@ -150,6 +152,7 @@ def test_a_log_that_is_silent_is_bridged(trial):
     assert times[-1] > 128.0
 
 
+@pytest.mark.slow
 def test_silence_of_a_beacon_is_said_and_makes_the_position_less_certain(trial):
     ranges = trial.find(Beacons)
     kept = (ranges.time < 100.0) | (ranges.time > 125.0)
@@ -162,6 +165,7 @@ def test_silence_of_a_beacon_is_said_and_makes_the_position_less_certain(trial):
     assert std[135] < std[125]
 
 
+@pytest.mark.slow
 def test_two_tracks_are_none(trial):
     straight = planar.trial(manoeuvres=[{"straight_s": 75}])
     with pytest.raises(SolveError, match="2 trajectories fit the ranges; turn by 30 degrees"):

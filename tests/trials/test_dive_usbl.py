@@ -95,6 +95,7 @@ def start(trial):
 
 
 # Of thirteen dives, that whose start the wrong fixes led 3 km away when all of them counted.
+@pytest.mark.slow
 @pytest.mark.parametrize("without_imu", [False, True])
 def test_gross_fixes_lead_no_start_elsewhere(without_imu):
     trial = simulate(config("dive-usbl", **(WITHOUT_IMU if without_imu else {})), 12)
