@@ -559,11 +559,11 @@ def _densities(
     log = trial.log
     if log is not None and log.locked.sum() >= 50:
         rows = np.flatnonzero(log.locked)
-        time = log.time[rows] - float(values["time_offset_s"][0])
+        lag = float(values["time_offset_s"][0])
+        time = log.time[rows] - lag
         mounting = values.get("misalignment_deg", np.eye(3))
         v_b = log.velocity[rows] @ mounting
         interval = float(np.median(np.diff(time)))
-        lag = float(values["time_offset_s"][0])
         at_pings = phases(record, time + late, trial, mounting, late - lag)[:, 3:]
         for kind, i, where in each_phase(phase[:, 3:]):
             spans = _LEG_SPANS if kind == STAYS else (interval, 2.0 * interval)

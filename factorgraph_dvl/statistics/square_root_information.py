@@ -40,9 +40,7 @@ class ByKey(Mapping[int, Array]):
         self._keys, self._first, self._table = keys, first, table
 
     def __getitem__(self, key: int) -> Array:
-        i = int(np.searchsorted(self._keys, key))
-        if i == self._keys.size or self._keys[i] != key:
-            raise KeyError(key)
+        i = int(_places(self._keys, np.array(key)))
         return self._table[self._first[i] : self._first[i + 1]]
 
     def __iter__(self) -> Iterator[int]:
@@ -53,7 +51,7 @@ class ByKey(Mapping[int, Array]):
 
     def stacked(self, keys: IntArray, size: int) -> Array:
         """Return the rows (M, size, n) of variables of one size."""
-        rows = self._first[np.searchsorted(self._keys, keys)]
+        rows = self._first[_places(self._keys, keys)]
         return np.asarray(self._table[rows[:, None] + np.arange(size)])
 
 
@@ -292,11 +290,11 @@ class SquareRootInformation:
     def joint_covariances(self, groups: Sequence[tuple[int, ...]]) -> list[Array]:
         """Return the joint covariances of groups of variables that a factor ties together."""
         alike: defaultdict[tuple[int, ...], list[int]] = defaultdict(list)
-        size = dict(zip(self._keys.tolist(), self._sizes.tolist(), strict=True))
         for i, group in enumerate(groups):
-            alike[tuple(size[key] for key in group)].append(i)
+            own = [self._rows[key] for key in group]
+            alike[tuple(each.stop - each.start for each in own)].append(i)
         numbers = list(alike.values())
-        keys = [np.array([groups[i] for i in own]) for own in numbers]
+        keys = [np.array([groups[i] for i in some]) for some in numbers]
         out: list[Array] = [np.empty((0, 0))] * len(groups)
         for part, items, found in self.joint_in_parts(keys):
             for i, P in zip(items.tolist(), found, strict=True):
@@ -337,9 +335,7 @@ class SquareRootInformation:
         """Return groups in the order of their cliques: components, cliques, and numbers."""
         if not len(keys):
             return np.zeros((0, 0), int), np.zeros(0, int), np.zeros(0, int)
-        place = np.minimum(np.searchsorted(self._keys, keys), self._keys.size - 1)
-        if (self._keys[place] != keys).any():
-            raise KeyError("a variable of a group is not in the graph")
+        place = _places(self._keys, keys)
         sizes = self._sizes[place[0]]
         within = np.concatenate([np.arange(size) for size in sizes.tolist()])
         own = self._first[place].repeat(sizes, axis=1) + within
@@ -423,6 +419,16 @@ def _without(each: _Cliques, is_known: BoolArray) -> Iterator[_Cliques]:
                 each.T[own, :n][:, :, columns],
                 each.d[own, :n],
             )
+
+
+def _places(every: IntArray, keys: IntArray) -> IntArray:
+    """Return where keys stand among all, ascending; KeyError if one of them does not."""
+    place = np.searchsorted(every, keys)
+    found = place < every.size
+    missing = ~found | (every[np.where(found, place, 0)] != keys) if every.size else ~found
+    if missing.any():
+        raise KeyError(f"variables that are not in the graph: {keys[missing].tolist()}")
+    return np.asarray(place)
 
 
 def _width(functionals: Sequence[Mapping[int, Array]]) -> int:

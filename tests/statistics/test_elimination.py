@@ -98,6 +98,11 @@ def test_a_variable_that_is_not_there_is_named_and_no_other_taken(chain):
     found = eliminated(graph, keys.ordering(order), sizes)
     with pytest.raises(KeyError):
         found.joint_covariances([(NODES + 3,)])
+    with_shared = found.covariance_with([{SHARED: np.eye(SIZE)}])
+    for key in (NODES + 3, SHARED + 1):
+        assert key not in with_shared
+        with pytest.raises(KeyError):
+            with_shared.stacked(np.array([SHARED, key]), SIZE)
 
 
 def test_cholesky_has_the_digits_of_what_is_well_conditioned_and_says_where_it_has_none(chain):
