@@ -24,6 +24,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -31,7 +32,12 @@ from matplotlib.figure import Figure
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.campaign.cluster import connected
+from factorgraph_dvl.graph import keys
+from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.statistics.elimination import eliminated
+from factorgraph_dvl.statistics.marginal_likelihood import restricted_objective
 from factorgraph_dvl.trial import Trial
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -161,6 +167,30 @@ def kept_runs(
             file.flush()
             print(f"{number} of {len(running)}:", *each, flush=True)
     return [kept[each] for each in wanted]
+
+
+def objective_again(found: SolvedProblem) -> float:
+    """Return the objective at a minimum, by a problem made anew and another elimination."""
+    problem, evaluation = found.problem, found.minimum.evaluation
+    again = Problem(
+        problem.chain,
+        problem.observations,
+        problem.all_parameters,
+        start=evaluation.parameters,
+        processes=problem.processes,
+    )
+    again.noise_factors = problem.noise_factors
+    again.long_run, again.gain = problem.long_run, problem.gain
+    again.robust_weights = problem.robust_weights
+    for bound, weight in zip(again.bound, problem.weights, strict=True):
+        bound.weight = weight
+    there = again.evaluate(evaluation.values)
+    graph = again.linearize(there)
+    last = [*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)]
+    order = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
+    first = [key for key in map(order.at, range(order.size())) if key not in set(last)]
+    information = eliminated(graph, keys.ordering([*first, *last]), there.values.dims())
+    return float(restricted_objective(again, there, information))
 
 
 def new_figure(width: float, height: float) -> Figure:

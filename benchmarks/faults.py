@@ -33,7 +33,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.simulation import faults as f
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.levenberg_marquardt import minimise
 from factorgraph_dvl.solvers.preparation import mounted_start, prepare
 from factorgraph_dvl.solvers.state_times import STATE_INTERVAL
@@ -81,11 +81,16 @@ def outcome(run: Run) -> dict[str, Any]:
         start = time.process_time()
         try:
             trial = load_trial(Path(folder) / "trial")
-            solution = solve(trial, rate_hz=1.0)
+            solution, solved = solve_with_problem(trial, rate_hz=1.0)
         except FactorgraphDvlError as error:
             return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
+    seconds = time.process_time() - start
+    objective = [step.objective for step in solution.steps]
     return {
-        "cpu_s": round(time.process_time() - start, 1),
+        "cpu_s": round(seconds, 1),
+        "rises": int(np.sum(np.diff(objective) > 0.0)),
+        # What the record of steps ends with, and what a problem made anew says of it.
+        "again": common.objective_again(solved) - objective[-1],
         **errors(solution, made),
         # Of interest where nothing is said: there it tells whether something could have been.
         "cost": _cost(trial) if solution.verdict.grade == "good" else np.nan,
@@ -232,6 +237,19 @@ def summary(faulty: Sequence[tuple[Run, dict[str, Any], float]]) -> list[str]:
         f"true cause in {len(named)} of these ({100.0 * len(named) / max(len(graded), 1):.0f} %). "
         f"{len(silent)} with an error above {LARGE:g} σ are graded good, {len(seen)} of them with "
         f"λ of {SEEN:g} or more. {len(crashed)} crashed.",
+        "",
+        *_objectives([x[1] for x in faulty if "again" in x[1]]),
+    ]
+
+
+def _objectives(found: Sequence[dict[str, Any]]) -> list[str]:
+    """Return what is said of the records of steps."""
+    rises = sum(each["rises"] for each in found)
+    most = max((abs(each["again"]) for each in found), default=0.0)
+    return [
+        f"The objective rises from one step to the next {rises} times in the {len(found)} runs "
+        "that are solved. A problem made anew, eliminated in another order, has the same "
+        f"objective at the end within {most:.2g}.",
     ]
 
 

@@ -10,7 +10,7 @@ from truth import scenario
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.trial import Trial
 
-COUNT = 40
+COUNT = 15
 # Rates at which stamps fall on, between and half-way between the times of states.
 _IMU = (50.0, 64.0, 100.0, 100.0, 125.0, 128.0, 200.0)
 _AIDS = (1.0, 2.0, 4.0, 5.0, 7.3, 8.0, 10.0)

@@ -10,8 +10,10 @@ from gtsam.symbol_shorthand import B, R, W, X
 
 from factorgraph_dvl.geometry.vectors import IntArray
 
-# Chosen: all letters but those of states, biases, attitudes and rates.
-_LETTERS = [c for c in string.ascii_letters + string.digits if c not in "brwx"]
+# Letters of variables that belong to a node: biases, attitudes, rates, states.
+OF_NODES = "brwx"
+# Chosen: all letters but those.
+_LETTERS = [c for c in string.ascii_letters + string.digits if c not in OF_NODES]
 # Letters of correlated errors. Chosen: what no other variable has.
 _PROCESSES = string.punctuation
 

@@ -45,7 +45,7 @@ def rows_with_times(problem: Problem, every: Iterable[Rows]) -> Iterator[tuple[R
         elif rows.keys.shape[1] > 1:
             first = rows.keys[:, 0]
             letter = keys.letter_of(int(first[0]))
-            if letter in "xb" or letter in processes:
+            if letter in keys.OF_NODES or letter in processes:
                 yield rows, processes.get(letter, node_time)[keys.indices_of(first)]
 
 

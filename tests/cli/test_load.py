@@ -1,6 +1,6 @@
 """Commands four at a time on two cores, some of them interrupted: as alone on a quiet machine.
 
-FACTORGRAPH_DVL_LOAD sets the number of runs, 40 by default.
+FACTORGRAPH_DVL_LOAD sets the number of runs, 20 by default.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from kinds import TRIALS
 
 from factorgraph_dvl.files.trial_folder import save_trial
 
-RUNS = int(os.environ.get("FACTORGRAPH_DVL_LOAD", "40"))
+RUNS = int(os.environ.get("FACTORGRAPH_DVL_LOAD", "20"))
 # Codes that docs/format.md lists.
 _DONE, _INTERRUPTED = (0, 1, 2), 130
 _COMMANDS = (

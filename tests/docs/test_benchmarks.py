@@ -103,8 +103,11 @@ def test_a_changed_tree_is_named(benchmark, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    # One seed of the beams takes five minutes.
-    [pytest.param(n, marks=pytest.mark.study) if n == "beams" else n for n in SAMPLED],
+    # One seed of these takes minutes.
+    [
+        pytest.param(n, marks=pytest.mark.study) if n in ("beams", "sea_trial") else n
+        for n in SAMPLED
+    ],
 )
 def test_the_numbers_of_one_seed_are_those_of_the_page(name, benchmark):
     module = benchmark(name)

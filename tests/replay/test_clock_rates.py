@@ -2,7 +2,7 @@
 
     pytest -m slow tests/replay/test_clock_rates.py
 
-runs all 40 trials in two processes.
+runs all trials in two processes.
 """
 
 from __future__ import annotations

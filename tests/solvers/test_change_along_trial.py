@@ -11,9 +11,13 @@ from truth import config
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers.batch import solve_with_problem
+from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.preparation_without_imu import prepare_without_imu
 from factorgraph_dvl.solvers.rounds import settle
+from factorgraph_dvl.statistics.constancy import by_interval
+from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 
 pytestmark = pytest.mark.slow
 
@@ -65,3 +69,23 @@ def test_a_mount_that_turns_is_found(seed):
 def test_an_honest_mount_is_not_accused(seed):
     trial = simulate(config("ship", manoeuvres=LINES * 2, **ACCURATE), seed)
     assert max(t.change.significance for t in most_probable_changes(trial)) < CHANGED
+
+
+def test_scores_of_all_times_are_the_slope_of_the_objective():
+    """Where the rows of the motion had no times, a third of it was missing."""
+    _, found = solve_with_problem(
+        simulate(config("ship-water", manoeuvres=LINES * 3), 0), rate_hz=1.0
+    )
+    problem, evaluation = found.problem, found.minimum.evaluation
+    (functional,) = (by for p, _, by in reported(problem, evaluation) if p.name == "scale_error")
+    information = found.covariances.information
+    following = information.covariance_with([functional])
+    rows = rows_with_times(problem, rows_by_source(problem, evaluation))
+    score, _ = by_interval(rows, following, np.zeros(0))
+    along = sum(
+        following[problem.key(name)].T @ problem.tilt.gradient[own]
+        for name, own in problem.columns.items()
+    )
+    # Priors are wide.
+    assert abs(along[0]) > 0.3 * np.sqrt(information.covariance_of([functional])[0, 0])
+    np.testing.assert_allclose(score[0], along, rtol=0.02)

@@ -102,7 +102,14 @@ def test_what_residuals_do_not_show_of_positions_moves_the_trajectory_and_nothin
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tau", [15.0, 100.0, 600.0])
+@pytest.mark.parametrize(
+    "tau",
+    [
+        pytest.param(15.0, marks=pytest.mark.study),
+        100.0,
+        pytest.param(600.0, marks=pytest.mark.study),
+    ],
+)
 def test_positions_hold_their_standard_deviations_under_slow_errors(tau):
     plan = yaml.safe_load((CONFIGS / "data-sheet-mix-tactical.yaml").read_text(encoding="utf-8"))
     plan["imu"]["time_offset_s"] = 0

@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from dense_rows import dense, place_of, width_of
 from exactness import worst_relative
+from kinds import TRIALS
 from problems import SHORT, dense_covariance, problem_of, walking
 from truth import scenario
 
+from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.leverage import leverage
-from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_by_source
+from factorgraph_dvl.statistics.rows import (
+    add_transposed_product,
+    product,
+    rows_by_source,
+    rows_with_times,
+)
 
 
 @pytest.fixture(scope="module", params=["constant", "walking"])
@@ -86,3 +93,15 @@ def test_sums_of_leverages_are_those_of_the_dense_hat_matrix(system):
         assert np.all(np.abs(found.sum(axis=0) - exact) < 3.0 * np.sqrt(exact / 16.0) + 1e-6)
     total = sum(np.einsum("mdi,ij,mdj->", J, P, J) for J in matrices)
     assert total == pytest.approx(width_of(place), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["imu", "ship", "beacon"])
+def test_all_rows_but_priors_have_times(kind):
+    _, found = solve_with_problem(TRIALS[kind](), rate_hz=1.0)
+    evaluation = found.minimum.evaluation
+    observed = {o.label for o in found.problem.observations}
+    every = list(rows_by_source(found.problem, evaluation))
+    timed = [rows for rows, _ in rows_with_times(found.problem, every)]
+    left_out = [r for r in every if not any(r is each for each in timed)]
+    assert len(left_out) < len(every)
+    assert all(r.keys.shape[1] == 1 and r.source not in observed for r in left_out)

@@ -17,7 +17,7 @@ from factorgraph_dvl.solvers.batch import solve
 
 pytestmark = pytest.mark.slow
 
-RUNS = 10
+RUNS = 5
 # Two-sided probability that a mean of an honest solver leaves its band.
 RARE = 0.003
 TURNS = [

@@ -3,7 +3,8 @@
     pytest -m slow tests/trials/test_replay_monte_carlo.py
 
 runs 20 seeds of each scenario, half of them of the first minutes of two grades of the mix, and two
-of the whole of it; FACTORGRAPH_DVL_SEEDS runs another number.
+of the whole of it; FACTORGRAPH_DVL_SEEDS runs another number. `-m "slow and not study"` leaves out
+those that take minutes.
 """
 
 from __future__ import annotations
@@ -122,7 +123,16 @@ def one(job):
     return Run(name, np.array(nees), np.array(motion), (last - value) / std, ratio, time[0])
 
 
-@pytest.fixture(scope="module", params=TIMES)
+# Each of these takes minutes, and another scenario shows the same of a replay.
+_STUDIED = ("correlated noise, estimated", "data-sheet-mix-tactical, whole", "data-sheet-mix-mems")
+
+
+def scenarios(names):
+    """Return parameters of tests, of which some are only run before a release."""
+    return [pytest.param(n, marks=pytest.mark.study) if n in _STUDIED else n for n in names]
+
+
+@pytest.fixture(scope="module", params=scenarios(TIMES))
 def runs(request):
     # Two runs of the first minutes show too little of a band; those of tactical grade are quick.
     first_minutes, quick = request.param in RATE, "tactical" in request.param
@@ -133,7 +143,9 @@ def runs(request):
 
 
 # What a replay finds of correlated noise in the first minute is not what the whole trial shows.
-@pytest.mark.parametrize("runs", [n for n in TIMES if "estimated" not in n], indirect=True)
+@pytest.mark.parametrize(
+    "runs", scenarios(n for n in TIMES if "estimated" not in n), indirect=True
+)
 def test_every_run_starts_soon_and_ends_where_the_batch_solver_does(runs):
     assert max(r.started for r in runs) < 40.0
     worst = np.max(np.abs([r.apart for r in runs]), axis=0)
