@@ -34,15 +34,15 @@ INTRODUCTION = """\
 {origin}
 
 Simulated trials of the shipped scenarios, without a fault. A false reason is any reason of the
-verdict but `uncertain`, which says that a manoeuvre is missing. NEES/7 is that of misalignment,
+verdict but `uncertain` and `heading_unknown`, which say that a manoeuvre is missing. NEES/7 is that of misalignment,
 scale and lever arm: 1 on average where standard deviations are right.
 
 | scenario | runs | not converged | good, doubtful, do not use | false reasons | NEES/7 \
 | steps: mean, most | objective rises | CPU, s |
 |---|---:|---:|---|---|---:|---|---:|---:|
 """
-# What an honest trial may be told: that it lacks a manoeuvre.
-HONEST = {"uncertain"}
+# What an honest trial may be told: that it lacks a manoeuvre. Without a turn it has no heading.
+HONEST = {"uncertain", "heading_unknown"}
 
 
 def outcome(scenario: str, seed: int) -> dict[str, Any]:

@@ -22,7 +22,7 @@ def between_samples(inc: Increments, index: IntArray, since: Array) -> Partial:
     force is that of the cubic.
     """
     (rate, force), (rate_after, force_after) = (
-        edge_signals(inc, index, after=after) for after in (False, True)
+        inc.edge_signals(index, after=after) for after in (False, True)
     )
     phi, dv = inc.over(index)
     dt = inc.dt[index]
@@ -64,7 +64,7 @@ class Cubics:
 
 def cubics_between(inc: Increments, index: IntArray, since: Array) -> Cubics:
     """Return the cubics from the start of intervals (M,) to `since` seconds after it."""
-    before, after = (edge_signals(inc, index, after=after) for after in (False, True))
+    before, after = (inc.edge_signals(index, after=after) for after in (False, True))
     phi, dv = inc.over(index)
     dt = inc.dt[index]
     _, slopes = hermite(since / dt, dt)
@@ -99,31 +99,3 @@ def hermite(u: Array, length: Array) -> tuple[Array, Array]:
 def _cubic(weights: Array, *parts: Array) -> Array:
     """Return the cubic with a value of 0 before, a value after, and slopes, (M, 3) each."""
     return np.asarray(sum(w[:, :, 0] * part for w, part in zip(weights[1:], parts, strict=True)))
-
-
-def edge_signals(inc: Increments, index: IntArray, *, after: bool) -> Array:
-    """Return rate and force at the edges before or after intervals (M,), (2, M, 3)."""
-    time = inc.start[index] + (inc.dt[index] if after else 0.0)
-    out = np.empty((2, index.size, 3))
-    for mine, signals in inc.by_arc(index):
-        raw: Array | None = None
-        for i, signal in enumerate(signals):
-            if signal.spline is not None:
-                out[i, mine] = signal.spline(time[mine])
-                continue
-            raw = _raw_edge(inc, index[mine], after=after) if raw is None else raw
-            out[i, mine] = raw[:, 3 * i : 3 * i + 3]
-    return out
-
-
-def _raw_edge(inc: Increments, index: IntArray, *, after: bool) -> Array:
-    """Return rate and force (M, 6) at edges: half-way between the polynomials on both sides."""
-    near = np.clip(index + (1 if after else -1), 0, inc.dt.size - 1)
-    near = np.where(inc.arc_of[near] == inc.arc_of[index], near, index)
-    own, other = inc.coefficients(index), inc.coefficients(near)
-    # A polynomial's value is its first coefficient at the start, the sum of all at the end.
-    at_start, at_end = (own, other) if not after else (other, own)
-    first, last = at_start[:, 0], at_end.sum(axis=1)
-    alone = (near == index)[:, None]
-    own_edge = last if after else first
-    return np.where(alone, own_edge, 0.5 * (first + last))

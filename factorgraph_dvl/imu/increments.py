@@ -40,7 +40,9 @@ _ROUNDING = 1e-6
 _REGULAR = 0.1
 # Intervals whose polynomials are in memory at a time. Chosen: some MB.
 _CHUNK = 4000
-# Intervals up to which all increments are kept. Chosen: a replay asks twice for those of a second.
+# Intervals up to which all increments and signals at edges are kept. Chosen: some 100 MB.
+_KEPT = 1_000_000
+# Intervals from which on splines of rate and force share their knots. Chosen: a few seconds.
 _FEW = 1000
 # Samples that an arc has at least: those of the widest stencil.
 _LEAST = 6
@@ -129,14 +131,56 @@ class Increments(ArcPolynomials):
 
     def over(self, index: IntArray) -> tuple[Array, Array]:
         """Return phi and dv over whole intervals `index`, (M, 3) each."""
-        if self.dt.size <= _FEW:
+        if self.dt.size <= _KEPT:
             return self._every[0][index], self._every[1][index]
         return self._over(index)
 
     @cached_property
     def _every(self) -> tuple[Array, Array]:
-        """Increments over all intervals of a short record: asked for again and again."""
+        """Increments over all intervals: asked for again and again."""
         return self._over(np.arange(self.dt.size))
+
+    def edge_signals(self, index: IntArray, *, after: bool) -> Array:
+        """Return rate and force at the edges before or after intervals (M,), (2, M, 3)."""
+        if self.dt.size > _KEPT:
+            return self._edge_signals(index, after=after)
+        place = index + self.arc_of[index] + (1 if after else 0)
+        return self._every_edge.take(place, axis=1)
+
+    @cached_property
+    def _every_edge(self) -> Array:
+        """Rate and force at all edges, one more in each arc than it has intervals."""
+        every = np.arange(self.dt.size)
+        out = np.empty((2, self.dt.size + len(self.arcs), 3))
+        out[:, every + self.arc_of] = self._edge_signals(every, after=False)
+        last = self.arcs[:, 1] - 1
+        out[:, last + self.arc_of[last] + 1] = self._edge_signals(last, after=True)
+        return out
+
+    def _edge_signals(self, index: IntArray, *, after: bool) -> Array:
+        time = self.start[index] + (self.dt[index] if after else 0.0)
+        out = np.empty((2, index.size, 3))
+        for mine, signals in self.by_arc(index):
+            raw: Array | None = None
+            for i, signal in enumerate(signals):
+                if signal.spline is not None:
+                    out[i, mine] = signal.spline(time[mine])
+                    continue
+                raw = self._raw_edge(index[mine], after=after) if raw is None else raw
+                out[i, mine] = raw[:, 3 * i : 3 * i + 3]
+        return out
+
+    def _raw_edge(self, index: IntArray, *, after: bool) -> Array:
+        """Return rate and force (M, 6) at edges, half-way between the polynomials beside them."""
+        near = np.clip(index + (1 if after else -1), 0, self.dt.size - 1)
+        near = np.where(self.arc_of[near] == self.arc_of[index], near, index)
+        own, other = self.coefficients(index), self.coefficients(near)
+        # A polynomial's value is its first coefficient at the start, the sum of all at the end.
+        at_start, at_end = (own, other) if not after else (other, own)
+        first, last = at_start[:, 0], at_end.sum(axis=1)
+        alone = (near == index)[:, None]
+        own_edge = last if after else first
+        return np.where(alone, own_edge, 0.5 * (first + last))
 
     def _over(self, index: IntArray) -> tuple[Array, Array]:
         phi, dv = np.empty((index.size, 3)), np.empty((index.size, 3))
@@ -214,8 +258,9 @@ class Increments(ArcPolynomials):
         return rate.window, force.window
 
     def release(self) -> None:
-        """Free what `smoothed` keeps, about as much as the samples; it is found anew if needed."""
-        vars(self).pop("smoothed", None)
+        """Free what is kept beside the samples, some times as much; it is found anew if needed."""
+        for name in ("smoothed", "_every", "_every_edge"):
+            vars(self).pop(name, None)
 
     @cached_property
     def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:

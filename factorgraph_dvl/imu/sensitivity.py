@@ -17,7 +17,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray, rotate, skew
-from factorgraph_dvl.imu.between_samples import edge_signals, hermite
+from factorgraph_dvl.imu.between_samples import hermite
 from factorgraph_dvl.imu.preintegration import Integrals, Segments, Strides
 from factorgraph_dvl.imu.propagation import Attachment, Transition, attitude_jacobian
 from factorgraph_dvl.imu.two_way import TwoWay, carried_back
@@ -137,9 +137,9 @@ def sensitivities(
         ):
             first = seg.first[at.segment[own]] + seg.stride * number
             last = np.minimum(first + seg.stride, seg.last[at.segment[own]]) - 1
-            begin = _Edge(strides.dR[place], *edge_signals(seg.increments, first, after=False))
+            begin = _Edge(strides.dR[place], *seg.increments.edge_signals(first, after=False))
             phi, length, turning = strides.phi[place], strides.duration[place], alpha[place]
-            end = _Edge(begin.dR @ exp_so3(phi), *edge_signals(seg.increments, last, after=True))
+            end = _Edge(begin.dR @ exp_so3(phi), *seg.increments.edge_signals(last, after=True))
             since = seg.node_time[at.node[own]] + at.tau[own] - strides.start[place]
             before = tuple(out[own] for out in outs)
             means = _means(phi, strides.dv[place], length, turning)
@@ -349,8 +349,8 @@ def _accelerations(
     number = np.arange(len(out)) - np.repeat(strides.begins, strides.count)
     first = np.repeat(seg.first[block], strides.count) + seg.stride * number
     last = np.minimum(first + seg.stride, np.repeat(seg.last[block], strides.count)) - 1
-    before = edge_signals(seg.increments, first, after=False)[0]
-    after = edge_signals(seg.increments, last, after=True)[0]
+    before = seg.increments.edge_signals(first, after=False)[0]
+    after = seg.increments.edge_signals(last, after=True)[0]
     safe = np.where(strides.duration > _LEAST_STEP, strides.duration, np.inf)
     return np.asarray((after - before) / safe[:, None])
 
