@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtri
@@ -16,8 +17,13 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
-from factorgraph_dvl.solvers.record_scores import by_square, record_scores, window_part
-from factorgraph_dvl.statistics.scores import Scores
+from factorgraph_dvl.solvers.record_scores import (
+    by_square,
+    record_scores,
+    record_sums_in_turn,
+    window_part,
+)
+from factorgraph_dvl.statistics.scores import Score, Scores
 
 # Share of the sensors that neither average nor are late for which a time is tried all the same.
 # Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
@@ -65,9 +71,27 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
         # One-sided: lengths are above zero.
         shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
         if found[cause] > shown * scatter and explains:
-            step = tests.test([cause]).step
-            out[cause] = np.sqrt(step) if cause == _length(bound) else known[cause].mean + step
+            test = tests.test([cause])
+            if share > 1.0:
+                test = _by_all(problem, bound, minimum, cause)
+            step, std = test.step, test.std
+            if cause == _length(bound):
+                step = np.sqrt(np.maximum(step, 0.0))
+                std = std / (2.0 * np.maximum(step, np.finfo(float).tiny))
+            # What would not lower the objective is not tried: it takes another solution.
+            plausible = np.full(1, known[cause].spec.plausible) * known[cause].si
+            if step[0] > 0.0 and replace(test, std=std).evidence(plausible) > 0.0:
+                out[cause] = step if cause == _length(bound) else known[cause].mean + step
     return out
+
+
+def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: str) -> Score:
+    """Return the test of one time by all measurements of a record."""
+    evaluation = minimum.evaluation
+    information = minimum.square_root or factorized(problem, evaluation)[0]
+    sums = record_sums_in_turn(problem, bound, evaluation, name, squared=name == _length(bound))
+    known = sums.square - information.covariance_of([sums.by_key])
+    return Scores({name: slice(0, 1)}, sums.score, known, np.full(1, np.inf)).test([name])
 
 
 def _misfit(bound: BoundObservation, residual: Array) -> float:

@@ -126,6 +126,33 @@ def record_sums(
     return RecordSums(score, square, taken_up)
 
 
+def record_sums_in_turn(
+    problem: Problem, bound: BoundObservation, evaluation: Evaluation, name: str, *, squared: bool
+) -> RecordSums:
+    """Return what the rows of a long record say of one number, some of them after the other.
+
+    Parameters
+    ----------
+    problem, bound, evaluation : Problem, BoundObservation or Evaluation
+        As of `record_scores`.
+    name : str
+        Name of the parameter.
+    squared : bool
+        Whether it is the length of a window, and the number its square.
+    """
+    wide = {name: np.full(1, np.inf)}
+    score, square, by_key = np.zeros(1), np.zeros((1, 1)), dict[int, Array]()
+    count = bound.observation.time.size
+    for begin in range(0, count, _CHUNK):
+        part = part_of(bound, np.arange(begin, min(begin + _CHUNK, count)), evaluation)
+        squares = {name: by_square(problem, part, evaluation)} if squared else {}
+        sums = record_sums(problem, part, evaluation, wide, None, squares)
+        score, square = score + sums.score, square + sums.square
+        for key, rows in sums.by_key.items():
+            by_key[key] = by_key[key] + rows if key in by_key else rows
+    return RecordSums(score, square, by_key)
+
+
 def window_part(bound: BoundObservation, evaluation: Evaluation) -> tuple[BoundObservation, float]:
     """Return measurements of an observation that show its window, and how many each stands for."""
     count = bound.observation.time.size
