@@ -135,15 +135,14 @@ def motion_strengths(
         nodes = values[process.name].copy()
         nodes[:, : ratio.size] /= np.where(ratio > 0.0, ratio, 1.0)
         values[process.name] = nodes
-    before = np.zeros(len(covariance)) if problem.tilt is None else problem.tilt.gradient
     if problem.tilt is not None and problem.tilt.hold is None:
         # At a minimum the step is this; where the slope jumps, the linear model has another.
-        moved = covariance @ before
+        moved = covariance @ problem.tilt.gradient
     else:
         step = information.solution()
         every = [step.at(problem.key(name)) for name in problem.columns]
         moved = np.concatenate(every or [np.zeros(0)])
-    tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient, before)
+    tilt, moved = _next_tilt(evaluation.parameters, covariance, moved, gradient)
     other = (np.abs(wanted) > _SAME) & (gain > least_gain)
     same = not other.any() and float(np.abs(moved).max(initial=0.0)) < _SAME_CONSTANTS
     return Strengths(
@@ -216,12 +215,12 @@ def _step(strengths: Sequence[_Strength], score: RestrictedScore) -> tuple[Array
 
 
 def _next_tilt(
-    values: Mapping[str, Array], covariance: Array, step: Array, gradient: Array, before: Array
+    values: Mapping[str, Array], covariance: Array, step: Array, gradient: Array
 ) -> tuple[Tilt, Array]:
     """Return the tilt at some values, and the step of the parameters that it asks for, in σ.
 
-    The gradient is valid near by. Where its change alone moves the parameters by more than
-    `_TRUSTED`, they are damped. Over hours the gradient itself moves them by more.
+    The gradient is valid near by. Where it alone moves the parameters by more than `_TRUSTED`,
+    they are damped.
 
     Parameters
     ----------
@@ -233,8 +232,6 @@ def _next_tilt(
         Step to the minimum without a tilt.
     gradient : ndarray, shape (P,)
         Half that of the log determinant.
-    before : ndarray, shape (P,)
-        The same, of the tilt before.
     """
     sigma = np.sqrt(np.diag(covariance))
     by_gradient = covariance @ gradient / np.maximum(sigma, 1e-300)
@@ -242,8 +239,7 @@ def _next_tilt(
     correlation = covariance / np.maximum(np.outer(sigma, sigma), 1e-300)
     root = np.linalg.cholesky(correlation)
     inverse = np.asarray(solve_triangular(root, np.eye(sigma.size), lower=True))
-    by_change = covariance @ (gradient - before) / np.maximum(sigma, 1e-300)
-    far = float(np.linalg.norm(inverse @ by_change))
+    far = float(np.linalg.norm(inverse @ by_gradient))
     hold = None
     if far > _TRUSTED:
         hold = np.sqrt(far / _TRUSTED - 1.0) * inverse / sigma
