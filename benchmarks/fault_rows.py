@@ -451,13 +451,6 @@ ROWS = (
         (gross("DVL"), r"dvl_truncation"),
     ),
     Row("DVL: averages", "s", (1.0, 3.0), lambda x: [g.dvl_averages(x)], (r"averaging",)),
-    Row(
-        "Compass: deviates",
-        "deg",
-        (1.0, 3.0),
-        lambda x: [g.compass_deviates((x, 0.5 * x, 0.3 * x, 0.2 * x))],
-        (r"compass_deviation",),
-    ),
     Row("IMU: gyros late", "s", (0.002, 0.01), lambda x: [g.gyros_late(x)], (r"gyro_delay",)),
     Row("IMU: gyros filtered", "s", (0.005, 0.03), lambda x: [g.gyros_lag(x)], (r"gyro_delay",)),
 )

@@ -74,15 +74,6 @@ def test_digits_windows_and_scales(trial):
     np.testing.assert_allclose(grown, moving.dvl.velocity * expected[:, None])
 
 
-def test_a_compass_deviates_by_its_heading(trial):
-    reference = replace(trial.reference, rph=trial.reference.rph + 0.5 * np.pi * np.eye(3)[2])
-    turned = replace(trial, reference=reference)
-    (compass,) = with_faults(turned, [g.compass_deviates((3.0, 1.0, 1.0, 2.0), 0.0)]).others
-    # At 90 deg: 3 - 2.
-    np.testing.assert_allclose(compass.rph[:, 2], np.radians(91.0), atol=1e-12)
-    assert np.isnan(compass.rph[:, :2]).all()
-
-
 def test_a_current_is_there_all_the_time(trial):
     still = replace(
         trial,
