@@ -34,8 +34,8 @@ INTRODUCTION = """\
 {origin}
 
 Simulated trials of the shipped scenarios, without a fault. A false reason is any reason of the
-verdict but `uncertain` and `heading_unknown`, which say that a manoeuvre is missing. NEES/7 is that of misalignment,
-scale and lever arm: 1 on average where standard deviations are right.
+verdict but `uncertain` and `heading_unknown`, which say that a manoeuvre is missing. NEES/7 is
+that of misalignment, scale and lever arm: 1 on average where standard deviations are right.
 
 | scenario | runs | not converged | good, doubtful, do not use | false reasons | NEES/7 \
 | steps: mean, most | objective rises | CPU, s |
