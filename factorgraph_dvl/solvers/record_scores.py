@@ -133,8 +133,12 @@ def record_sums_in_turn(
 
     Parameters
     ----------
-    problem, bound, evaluation : Problem, BoundObservation or Evaluation
-        As of `record_scores`.
+    problem : Problem
+        Problem without the parameter.
+    bound : BoundObservation
+        The observation.
+    evaluation : Evaluation
+        The minimum.
     name : str
         Name of the parameter.
     squared : bool
