@@ -33,9 +33,8 @@ from matplotlib.figure import Figure
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.campaign.cluster import connected
 from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.problem import Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solution import Solution
-from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.statistics.elimination import eliminated
 from factorgraph_dvl.statistics.marginal_likelihood import restricted_objective
 from factorgraph_dvl.trial import Trial
@@ -169,9 +168,13 @@ def kept_runs(
     return [kept[each] for each in wanted]
 
 
-def objective_again(found: SolvedProblem) -> float:
+def rises(solution: Solution) -> int:
+    """Return how often the objective rises from one step to the next."""
+    return int(np.sum(np.diff([step.objective for step in solution.steps]) > 0.0))
+
+
+def objective_again(problem: Problem, evaluation: Evaluation) -> float:
     """Return the objective at a minimum, by a problem made anew and another elimination."""
-    problem, evaluation = found.problem, found.minimum.evaluation
     again = Problem(
         problem.chain,
         problem.observations,

@@ -85,12 +85,12 @@ def outcome(run: Run) -> dict[str, Any]:
         except FactorgraphDvlError as error:
             return {"grade": "refused", "exit": exit_code_of(error), "reason": str(error)}
     seconds = time.process_time() - start
-    objective = [step.objective for step in solution.steps]
+    again = common.objective_again(solved.problem, solved.minimum.evaluation)
     return {
         "cpu_s": round(seconds, 1),
-        "rises": int(np.sum(np.diff(objective) > 0.0)),
-        # What the record of steps ends with, and what a problem made anew says of it.
-        "again": common.objective_again(solved) - objective[-1],
+        "rises": common.rises(solution),
+        # What a problem made anew says of what the record of steps ends with.
+        "again": again - solution.steps[-1].objective,
         **errors(solution, made),
         # Of interest where nothing is said: there it tells whether something could have been.
         "cost": _cost(trial) if solution.verdict.grade == "good" else np.nan,

@@ -51,7 +51,6 @@ def outcome(scenario: str, seed: int) -> dict[str, Any]:
     start = time.process_time()
     solution = solve(trial, rate_hz=1.0)
     cpu = time.process_time() - start
-    objective = [step.objective for step in solution.steps]
     return {
         "scenario": scenario,
         "seed": seed,
@@ -64,7 +63,7 @@ def outcome(scenario: str, seed: int) -> dict[str, Any]:
         "nees": common.nees(solution, trial.calibration_truth),
         "steps": [step.change for step in solution.steps[1:]],
         "iterations": solution.iterations,
-        "rises": int(np.sum(np.diff(objective) > 0.0)),
+        "rises": common.rises(solution),
     }
 
 

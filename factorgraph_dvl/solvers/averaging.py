@@ -15,6 +15,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solvers.known_parameters import evidence
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import (
@@ -24,6 +25,7 @@ from factorgraph_dvl.solvers.record_scores import (
     window_part,
 )
 from factorgraph_dvl.statistics.scores import Score, Scores
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Share of the sensors that neither average nor are late for which a time is tried all the same.
 # Chosen: each takes another solution; a window that is not tried leaves two standard deviations.
@@ -70,28 +72,30 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
         explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
         # One-sided: lengths are above zero.
         shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
-        if found[cause] > shown * scatter and explains:
-            test = tests.test([cause])
-            if share > 1.0:
-                test = _by_all(problem, bound, minimum, cause)
-            step, std = test.step, test.std
-            if cause == _length(bound):
-                step = np.sqrt(np.maximum(step, 0.0))
-                std = std / (2.0 * np.maximum(step, np.finfo(float).tiny))
-            # What would not lower the objective is not tried: it takes another solution.
-            plausible = np.full(1, known[cause].spec.plausible) * known[cause].si
-            if step[0] > 0.0 and replace(test, std=std).evidence(plausible) > 0.0:
-                out[cause] = step if cause == _length(bound) else known[cause].mean + step
+        if not (found[cause] > shown * scatter and explains):
+            continue
+        test = tests.test([cause]) if share == 1.0 else _by_all(problem, bound, minimum, cause)
+        if cause == _length(bound):
+            test = _of_length(test)
+        # What would not lower the objective is not tried: it takes another solution.
+        if test.step[0] > 0.0 and evidence(known[cause], test) > 0.0:
+            out[cause] = test.step if cause == _length(bound) else known[cause].mean + test.step
     return out
 
 
 def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: str) -> Score:
     """Return the test of one time by all measurements of a record."""
-    evaluation = minimum.evaluation
-    information = minimum.square_root or factorized(problem, evaluation)[0]
+    evaluation, information = minimum.evaluation, _information(problem, minimum)
     sums = record_sums_in_turn(problem, bound, evaluation, name, squared=name == _length(bound))
     known = sums.square - information.covariance_of([sums.by_key])
     return Scores({name: slice(0, 1)}, sums.score, known, np.full(1, np.inf)).test([name])
+
+
+def _of_length(test: Score) -> Score:
+    """Return the test of a length, s, by that of its square."""
+    length = np.sqrt(np.maximum(test.step, 0.0))
+    std = test.std / (2.0 * np.maximum(length, np.finfo(float).tiny))
+    return replace(test, step=length, std=std)
 
 
 def _misfit(bound: BoundObservation, residual: Array) -> float:
@@ -144,9 +148,13 @@ def _scores(
     Of many measurements, some, with how many each stands for. The square of the length stands in
     its place: it has a slope at 0.
     """
-    evaluation = minimum.evaluation
+    evaluation, information = minimum.evaluation, _information(problem, minimum)
     part, share = window_part(bound, evaluation)
-    information = minimum.square_root or factorized(problem, evaluation)[0]
     length = _length(bound)
     squares = {length: by_square(problem, part, evaluation)} if length in known else {}
     return record_scores(problem, part, evaluation, information, known, derivatives=squares), share
+
+
+def _information(problem: Problem, minimum: Minimum) -> SquareRootInformation:
+    """Return the information at a minimum, which may have been found without it."""
+    return minimum.square_root or factorized(problem, minimum.evaluation)[0]

@@ -24,7 +24,7 @@ from factorgraph_dvl.solvers.record_scores import record_sums_in_turn
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
-# IMU factors, or measurements, that are read at once. Chosen: some ten megabytes.
+# IMU factors that are read at once. Chosen: some ten megabytes.
 _CHUNK = 4096
 # Lengths of windows over plausible ones, over which is integrated. Chosen: to four digits.
 _LENGTHS = np.concatenate([[0.0], np.geomspace(1e-4, 5.0, 4000)])

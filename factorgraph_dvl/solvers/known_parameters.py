@@ -112,18 +112,18 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     same, at = with_scattered_noise(problem, evaluation, problem.all_parameters)
     changes = component_changes(same, at, factorized(same, at)[0])
     certain = [e for e in changes if e.change.chi2 > CHANGED**2]
-    significant.sort(key=lambda each: -_evidence(*each))
+    significant.sort(key=lambda each: -evidence(*each))
     parameter, test = significant[0]
     # A change costs as one component does of what there are as many of as measurements.
     count = sum(int(np.count_nonzero(w)) for w in problem.weights)
-    more = test.chi2 - _evidence(parameter, test) - float(np.log(count))
+    more = test.chi2 - evidence(parameter, test) - float(np.log(count))
     fall = test.chi2 * test.scatter - more
     if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
         return None
     others: tuple[str | Message, ...] = tuple(
         p.name
         for p, t in significant[1:]
-        if _evidence(parameter, test) - _evidence(p, t) < 2.0 * _TIE
+        if evidence(parameter, test) - evidence(p, t) < 2.0 * _TIE
     )
     others += tuple(
         message("unexplained_misfit.change", name=e.name, time=e.change.time)
@@ -140,7 +140,7 @@ def _limit(p: Parameter) -> float:
     return _LOG10_P_OF_RECORD if p.spec.of_record else _LOG10_P
 
 
-def _evidence(p: Parameter, test: Score) -> float:
+def evidence(p: Parameter, test: Score) -> float:
     """Return what a parameter takes off the objective if it may be anything plausible."""
     return test.evidence(wide(p, p.mean).sigma)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,20 +10,16 @@ import numpy as np
 import pytest
 from findings import of_code
 from problems import SHORT
-from truth import scenario
+from truth import CONFIGS, scenario
 
-from factorgraph_dvl.graph import keys
-from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers import rounds
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.solvers.model import least_objective
 from factorgraph_dvl.solvers.preparation import prepare
 from factorgraph_dvl.solvers.rounds import settle
 from factorgraph_dvl.solvers.steps import Noise
-from factorgraph_dvl.statistics.marginal_likelihood import restricted_objective
 
 
 def silent(stage, iteration, cost):
@@ -56,27 +53,10 @@ def test_the_objective_never_rises(settled):
     np.testing.assert_allclose(falls, -np.diff(objective))
 
 
-def test_another_problem_and_another_order_have_the_same_objective(settled):
-    problem, evaluation = settled.problem, settled.minimum.evaluation
-    again = Problem(
-        problem.chain,
-        problem.observations,
-        problem.all_parameters,
-        start=evaluation.parameters,
-        processes=problem.processes,
-    )
-    again.noise_factors = problem.noise_factors
-    again.long_run, again.gain = problem.long_run, problem.gain
-    again.robust_weights = problem.robust_weights
-    for bound, weight in zip(again.bound, problem.weights, strict=True):
-        bound.weight = weight
-    there = again.evaluate(evaluation.values)
-    ordering = problem.ordering()
-    order = [ordering.at(i) for i in range(ordering.size())]
-    last = [*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)]
-    of_states = sorted(set(order).difference(last))
-    again.ordering = lambda: keys.ordering([*of_states, *last])
-    found = restricted_objective(again, there, factorized(again, there)[0])
+def test_another_problem_and_another_order_have_the_same_objective(settled, monkeypatch):
+    monkeypatch.syspath_prepend(CONFIGS.parent / "benchmarks")
+    again = importlib.import_module("common").objective_again
+    found = again(settled.problem, settled.minimum.evaluation)
     assert found == pytest.approx(settled.steps[-1].objective, abs=1e-2)
 
 

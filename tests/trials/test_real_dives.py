@@ -101,7 +101,7 @@ def test_mistakes_are_named_one_after_the_other(tmp_path):
 
 
 def test_lever_arms_and_clocks_agree_with_what_the_checks_propose(tmp_path):
-    dives = ALL[:3:2]
+    dives = ALL[::2]
     arms, P, clocks = [], [], []
     for number in dives:
         found = proposed(written(tmp_path / f"{number}", number, corrected=True))
