@@ -179,9 +179,12 @@ def objective_again(problem: Problem, evaluation: Evaluation) -> float:
         problem.chain,
         problem.observations,
         problem.all_parameters,
-        start=evaluation.parameters,
+        # Which measurements the chain covers goes by where clocks were then.
+        start=problem.bound_at,
+        clock_zero=problem.clock_zero,
         processes=problem.processes,
     )
+    again.reject(problem.rejected)
     again.noise_factors = problem.noise_factors
     again.long_run, again.gain = problem.long_run, problem.gain
     again.robust_weights = problem.robust_weights
