@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from factorgraph_dvl.estimates import Estimate, Hypothesis, Noise, Residuals, noise_name
 from factorgraph_dvl.geometry.earth import LocalFrame
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.scale_causes import scale_cause
@@ -44,11 +44,11 @@ NOISE_FACTORS = (0.5, 2.0)
 # hardly matter make a contradiction.
 _INFORMED = 0.95
 
-# Root mean square of normalised residuals from which on a filter has not converged, unless a
-# few of them are so large by chance, of this probability. Chosen: noise stated half as large as
-# it is.
+# Root mean square of normalised residuals from which on a filter has not converged. Chosen: noise
+# stated half as large as it is.
 CONTRADICTS = 2.0
 
+# Probability of a few values that are so large by chance.
 _CHANCE = 1e-3
 
 # Share of outliers from which on they are a contradiction. Chosen: a good log has some.
@@ -70,17 +70,18 @@ def consistency_findings(
     unless their noise was estimated; a value far outside its prior says that prior or data are
     wrong.
     """
-    factors = {n.name: n.factor for n in noise}
+    estimated = {n.name: n for n in noise}
     out = []
     for e in estimates:
         out += _far_from_prior(e) + _impossible_scale(e)
     for r in residuals:
-        out += _size_of_residuals(r, factors.get(noise_name(r.label)))
+        out += _size_of_residuals(r, estimated.get(noise_name(r.label)))
     return out
 
 
-def _size_of_residuals(r: Residuals, factor: Array | None) -> list[Finding]:
+def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     """Return a finding where residuals are larger or smaller than stated."""
+    factor = None if noise is None else noise.factor
     stated = r.sigma if factor is None else r.sigma / factor
     square = (r.residual / stated) ** 2
     rms = float(np.sqrt(np.nanmean(square))) if r.time.size else 0.0
@@ -94,7 +95,8 @@ def _size_of_residuals(r: Residuals, factor: Array | None) -> list[Finding]:
     if rms <= DO_NOT_FIT:
         code = Code.LARGE_RESIDUALS
         key = "large_residuals.stated" if factor is None else "large_residuals.estimated"
-        allowed = factor is not None and np.nanmax(factor) <= NOISE_FACTORS[1]
+        large = np.zeros(0) if noise is None else noise.factor[~_by_chance(r, noise)]
+        allowed = noise is not None and not np.nanmax(large, initial=0.0) > NOISE_FACTORS[1]
         severity = "note" if allowed else "warning"
     text = message(key, ratio=rms)
     if small:
@@ -109,6 +111,17 @@ def _size_of_residuals(r: Residuals, factor: Array | None) -> list[Finding]:
             components=list(r.components),
         )
     return [Finding(code, text, sensor=r.label, severity=severity)]
+
+
+def _by_chance(r: Residuals, noise: Noise) -> BoolArray:
+    """Return where what persists may have become that large by chance, (d,).
+
+    A record of length T has about 1 + T / (2 τ) independent values of a first-order process.
+    """
+    if noise.correlation_time is None:
+        return np.zeros(noise.factor.size, dtype=bool)
+    count = 1.0 + np.ptp(r.time) / (2.0 * noise.correlation_time)
+    return np.asarray(chdtrc(count, count * noise.factor**2) > _CHANCE)
 
 
 def _impossible_scale(e: Estimate) -> list[Finding]:

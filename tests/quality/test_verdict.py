@@ -114,3 +114,21 @@ def test_noise_is_a_reason_where_it_is_far_from_what_is_stated(size, factor, fou
     noise = [] if factor is None else [Noise("dvl_velocity", np.array(factor))]
     findings = consistency_findings([], [residuals], noise)
     assert [(f.code, f.severity) for f in findings] == found
+
+
+@pytest.mark.parametrize(
+    ("factor", "severity"),
+    # Two independent values exceed a mean square of f² with a probability of exp(-f²): that is
+    # 0.002 of 2.5, and 0.0007 of 2.7. White noise has 50.
+    [((2.5, 1.0), "note"), ((2.7, 1.0), "warning"), ((1.0, 2.5), "warning")],
+)
+def test_few_values_of_what_persists_may_be_large_by_chance(factor, severity):
+    scale = np.array(factor)
+    residuals = Residuals(
+        *("GNSS position", "m", ("east", "north"), np.arange(50.0)),
+        residual=np.full((50, 2), 2.0),
+        sigma=np.ones((50, 2)) * scale,
+    )
+    noise = Noise("gnss_position", scale, correlation_time=np.array([24.5, np.nan]))
+    (found,) = consistency_findings([], [residuals], [noise])
+    assert (found.code, found.severity) == (Code.LARGE_RESIDUALS, severity)
