@@ -29,7 +29,7 @@ _BLOCK_S = 10.0
 _TAKEN = 2
 # A parameter is one where it is so many standard deviations, and windows fit better for it by
 # this much of the log-likelihood. Chosen: chance gives neither in 10 000 trials.
-_CERTAIN = 6.0
+CERTAIN = 6.0
 _BETTER = 20.0
 # Misfit below which nothing is gained, m/s. Chosen: finer than any receiver's or DVL's digits.
 _LEAST_MISFIT = 1e-3
@@ -102,7 +102,7 @@ class ClockFit:
 
     def better_than(self, other: ClockFit, windows: np.ndarray) -> bool:
         """Whether its last parameter is certain, and some windows fit better for it."""
-        certain = abs(self.values[-1]) > _CERTAIN * self.sigma[-1]
+        certain = abs(self.values[-1]) > CERTAIN * self.sigma[-1]
         return bool(certain and self.gain(other, windows) > _BETTER)
 
 

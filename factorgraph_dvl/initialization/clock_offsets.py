@@ -15,6 +15,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.initialization.carried_windows import MARGIN_S
 from factorgraph_dvl.initialization.clock_fit import (
+    CERTAIN,
     ClockFit,
     Comparison,
     blocks,
@@ -57,9 +58,8 @@ _DOMINATES = 50.0
 _BESIDE = 4
 # Fewer blocks say nothing of the scatter between them, as on either side of a jump.
 _LEAST_BLOCKS = 6
-# Height of the score process, in standard deviations, from which on a rate or a jump is tried.
-# Chosen: without a change it stays below 3.2 in 99 % (Andrews 1993).
-_CHANGES = 3.2
+# Standard deviations of a step that fits a constant rate best, over those of the rate itself.
+_STEP_OF_RATE = np.sqrt(0.75)
 # Variance that a window may have beside the usual one for a rate or a jump to be believed. Chosen:
 # turns leave ten times more than straight courses where a lever arm is not quite right.
 _ALIKE_WINDOWS = 30.0
@@ -332,7 +332,10 @@ def _nearest_of(
 
 
 def _changes(comparison: Comparison, fit: ClockFit) -> bool:
-    """Whether the offset seems to change along the trial, by its scores."""
+    """Whether the offset may change along the trial by what is certain, by its scores.
+
+    A change of z standard deviations scatters the scores of B blocks by 1 + z²/B more in variance.
+    """
     order = np.argsort(comparison.time, axis=None)
     share = np.cumsum(fit.information.ravel()[order])
     share /= max(share[-1], 1e-12)
@@ -342,7 +345,8 @@ def _changes(comparison: Comparison, fit: ClockFit) -> bool:
     scale = float(np.sqrt(np.sum(of_blocks**2)))
     inner = (share > 0.1) & (share < 0.9)
     height = np.abs(process) / np.sqrt(np.maximum(share * (1.0 - share), 0.01)) * inner
-    return bool(height.max() > _CHANGES * max(scale, 1e-12))
+    least = _STEP_OF_RATE * CERTAIN / np.sqrt(1.0 + CERTAIN**2 / np.count_nonzero(of_blocks))
+    return bool(height.max() > least * max(scale, 1e-12))
 
 
 def _drift(comparison: Comparison, middle: float, offsets: Sequence[float]) -> tuple[float, float]:

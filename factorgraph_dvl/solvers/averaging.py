@@ -149,10 +149,11 @@ def _scores(
     its place: it has a slope at 0.
     """
     evaluation, information = minimum.evaluation, _information(problem, minimum)
-    part, share = window_part(bound, evaluation)
+    part, motion, share = window_part(problem, bound, evaluation)
     length = _length(bound)
     squares = {length: by_square(problem, part, evaluation)} if length in known else {}
-    return record_scores(problem, part, evaluation, information, known, derivatives=squares), share
+    scores = record_scores(problem, part, evaluation, information, known, motion, squares)
+    return scores, share
 
 
 def _information(problem: Problem, minimum: Minimum) -> SquareRootInformation:

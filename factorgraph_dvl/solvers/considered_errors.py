@@ -69,8 +69,7 @@ def considered_errors(
         found.append((f"slow errors of {label}", "all that residuals do not show", sums))
     out = []
     for cause, assumed, sums in found:
-        by_key = information.covariance_with([sums])
-        changes = {key: -change for key, change in by_key.items()}
+        changes = information.covariance_with([sums]).times(-1.0)
         out.append(ConsideredError(cause, assumed, changes))
     return (*out, *_by_windows(problem, evaluation, information))
 
@@ -91,16 +90,15 @@ def _by_windows(
             continue
         sums = record_sums_in_turn(problem, bound, evaluation, p.name, squared=True)
         moved = information.covariance_with([sums.by_key])
-        taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in sums.by_key.items())
-        known = max(float(sums.square[0, 0]) - taken_up, 0.0)
+        taken_up = moved.after(sums.by_key)
+        known = max(float((sums.square - taken_up)[0, 0]), 0.0)
         # Means over windows that share pings are rare.
         between = np.diff(np.unique(bound.observation.time))
         longest = min(p.spec.plausible, float(np.median(between)) if between.size else np.inf)
         size = likely_square(float(sums.score[0]), known, longest)
-        changes = {key: -size * change for key, change in moved.items()}
         label = bound.observation.label
         upto = f"up to {np.sqrt(2.0 * size):.2g} s"
-        yield ConsideredError(f"averaging of {label}", upto, changes)
+        yield ConsideredError(f"averaging of {label}", upto, moved.times(-size))
 
 
 def likely_square(score: float, information: float, plausible: float) -> float:

@@ -9,11 +9,12 @@ from types import MappingProxyType
 
 import numpy as np
 
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.observation_rows import ObservationRows
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.sensors.protocol import Motion, ObservationByRows
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.scores import Scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -53,7 +54,7 @@ def record_scores(
     evaluation: Evaluation,
     information: SquareRootInformation,
     candidates: Mapping[str, Array],
-    motion: Motion | None = None,
+    motion: Motion,
     derivatives: Mapping[str, Array] = MappingProxyType({}),
 ) -> Scores:
     """Return scores and information of parameters that change one record only.
@@ -77,8 +78,8 @@ def record_scores(
         Information on all variables there.
     candidates : mapping of str to ndarray
         Standard deviations (n,) of the wide prior of each, SI; they may be infinite.
-    motion : Motion, optional
-        Motion where the observation is attached, if it is known.
+    motion : Motion
+        Motion where the observation is attached.
     derivatives : mapping of str to ndarray, optional
         Derivatives (M, d, n) by some of the parameters, in place of those of the observation.
     """
@@ -94,13 +95,11 @@ def record_sums(
     bound: BoundObservation,
     evaluation: Evaluation,
     candidates: Mapping[str, Array],
-    motion: Motion | None = None,
+    motion: Motion,
     derivatives: Mapping[str, Array] = MappingProxyType({}),
 ) -> RecordSums:
     """Return what the rows of a record say of parameters; arguments as of `record_scores`."""
     values = evaluation.parameters
-    if motion is None:
-        motion = bound.motion(bound.attachment, evaluation.states, values)
     own, processes = bound.parameters(problem.parameters), problem.processes_of(bound)
     wanted = [p.name for p in own]
     lin = bound.linearized(motion, values, [*wanted, *candidates], processes)
@@ -148,37 +147,47 @@ def record_sums_in_turn(
     score, square, by_key = np.zeros(1), np.zeros((1, 1)), dict[int, Array]()
     count = bound.observation.time.size
     for begin in range(0, count, _CHUNK):
-        part = part_of(bound, np.arange(begin, min(begin + _CHUNK, count)), evaluation)
+        some = np.arange(begin, min(begin + _CHUNK, count))
+        part, motion = part_of(problem, bound, some, evaluation)
         squares = {name: by_square(problem, part, evaluation)} if squared else {}
-        sums = record_sums(problem, part, evaluation, wide, None, squares)
+        sums = record_sums(problem, part, evaluation, wide, motion, squares)
         score, square = score + sums.score, square + sums.square
         for key, rows in sums.by_key.items():
             by_key[key] = by_key[key] + rows if key in by_key else rows
     return RecordSums(score, square, by_key)
 
 
-def window_part(bound: BoundObservation, evaluation: Evaluation) -> tuple[BoundObservation, float]:
-    """Return measurements of an observation that show its window, and how many each stands for."""
+def window_part(
+    problem: Problem, bound: BoundObservation, evaluation: Evaluation
+) -> tuple[BoundObservation, Motion, float]:
+    """Return measurements that show a window, their motion, and how many each stands for."""
     count = bound.observation.time.size
     some: IntArray = np.arange(count)
     if count > _ENOUGH:
         length = _ENOUGH // _STRETCHES
         first = np.linspace(0, count - length, _STRETCHES).astype(int)
         some = (first[:, None] + np.arange(length)).ravel()
-    return part_of(bound, some, evaluation), count / some.size
+    return *part_of(problem, bound, some, evaluation), count / some.size
 
 
-def part_of(bound: BoundObservation, some: IntArray, evaluation: Evaluation) -> BoundObservation:
-    """Return some of the measurements of an observation, weighed and attached as they are."""
+def part_of(
+    problem: Problem, bound: BoundObservation, some: IntArray, evaluation: Evaluation
+) -> tuple[BoundObservation, Motion]:
+    """Return some measurements of an observation as they are evaluated, and their motion."""
+    i = problem.bound.index(bound)
+    at, motion, whole = evaluation.attached[i], evaluation.motions[i], bound.observation
+    if some.size == whole.time.size:
+        return replace(bound, attachment=at), motion
     part = replace(
         bound,
-        observation=ObservationRows(bound.observation, some),
-        attachment=None,
+        observation=whole.some(some)
+        if isinstance(whole, ObservationByRows)
+        else ObservationRows(whole, some),
+        attachment=rows_of(at, some),
         usable=bound.usable[some],
         weight=bound.weight[some],
     )
-    part.attach(evaluation.parameters)
-    return part
+    return part, rows_of(motion, some)
 
 
 def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:

@@ -19,6 +19,7 @@ from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.imu.noise import noise_findings
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import DO_NOT_FIT
 from factorgraph_dvl.solution import Progress, SolverStep
 from factorgraph_dvl.solvers.averaging import averaging_findings
 from factorgraph_dvl.solvers.correlated_noise import correlated_noise, with_others
@@ -139,8 +140,9 @@ def settle(
         for step in steps:
             found, tried = _kept(step, at, report, _MOST_IN_VAIN - in_vain)
             iterations += tried
-            if found is None:
+            if found is None or _is_lost(found):
                 in_vain += tried
+            if found is None:
                 continue
             changed = changed or step.name
             fall, move = recorded.objective - found.objective, found.moved_from(recorded)
@@ -241,6 +243,13 @@ def _first(start: Proposal, report: Progress) -> Estimated:
     found = estimated(model, *reference, report, before=rough)
     iterations = minimum.iterations + found.minimum.iterations
     return replace(found, minimum=replace(found.minimum, iterations=iterations))
+
+
+def _is_lost(found: Estimated) -> bool:
+    """Whether no minimum was reached, and residuals are larger than any noise."""
+    minimum, weights = found.minimum, found.problem.weights
+    count = sum(int(np.count_nonzero(weight)) for weight in weights)
+    return not minimum.converged and 2.0 * minimum.evaluation.cost > DO_NOT_FIT**2 * count
 
 
 def _is_hopeless(proposal: Proposal, at: Estimated) -> bool:

@@ -54,6 +54,22 @@ class ByKey(Mapping[int, Array]):
         rows = self._first[_places(self._keys, keys)]
         return np.asarray(self._table[rows[:, None] + np.arange(size)])
 
+    def times(self, factor: float) -> ByKey:
+        """Return all rows times a factor."""
+        return ByKey(self._keys, self._first, factor * self._table)
+
+    def after(self, functional: Mapping[int, Array]) -> Array:
+        """Return a linear functional of all, (m, size) by key, of the rows, (m, n)."""
+        parts = [
+            matrix @ self._table[begin : begin + matrix.shape[1]]
+            for begin, matrix in zip(
+                self._first[_places(self._keys, np.array(list(functional)))],
+                functional.values(),
+                strict=True,
+            )
+        ]
+        return np.asarray(sum(parts))
+
 
 @dataclass(frozen=True)
 class _Cliques:

@@ -165,3 +165,16 @@ def test_less_of_what_makes_it_worse_is_not_tried(monkeypatch):
     worse = {1.0: 9.0, 0.5: 4.0, 0.25: 1.0, 0.125: -1.0}
     found, iterations = rounds._kept(Halved(), at, silent)
     assert (found.objective, iterations) == (-1.0, 4)
+
+
+@pytest.mark.parametrize(
+    ("converged", "misfit", "lost"),
+    [(False, 1.0, False), (True, 1e4, False), (False, 99.0, False), (False, 101.0, True)],
+)
+def test_what_has_no_minimum_and_does_not_fit_by_far_is_lost(converged, misfit, lost):
+    """Residuals ten times as large as stated are no noise: a stuck gyro took ten thousand steps."""
+    at = first_minimum(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1))
+    count = sum(np.count_nonzero(weight) for weight in at.problem.weights)
+    evaluation = replace(at.minimum.evaluation, cost=0.5 * misfit * count)
+    minimum = replace(at.minimum, evaluation=evaluation, converged=converged)
+    assert rounds._is_lost(replace(at, minimum=minimum)) == lost
