@@ -172,7 +172,7 @@ def test_less_of_what_makes_it_worse_is_not_tried(monkeypatch):
     [(False, 1.0, False), (True, 1e4, False), (False, 99.0, False), (False, 101.0, True)],
 )
 def test_what_has_no_minimum_and_does_not_fit_by_far_is_lost(converged, misfit, lost):
-    """Residuals ten times as large as stated are no noise: a stuck gyro took ten thousand steps."""
+    """Residuals ten times as large as stated are no noise: a stuck gyro took 10,000 steps."""
     at = first_minimum(simulate(scenario(manoeuvres=SHORT, noise=True), seed=1))
     count = sum(np.count_nonzero(weight) for weight in at.problem.weights)
     evaluation = replace(at.minimum.evaluation, cost=0.5 * misfit * count)
