@@ -40,7 +40,8 @@ _ROUNDING = 1e-6
 _REGULAR = 0.1
 # Intervals whose polynomials are in memory at a time. Chosen: some MB.
 _CHUNK = 4000
-# Intervals up to which all increments and signals at edges are kept. Chosen: some 100 MB.
+# Intervals up to which all increments, and signals at edges and smoothed, are kept. Chosen: some
+# 100 MB.
 _KEPT = 1_000_000
 # Intervals from which on splines of rate and force share their knots. Chosen: a few seconds.
 _FEW = 1000
@@ -258,9 +259,9 @@ class Increments(ArcPolynomials):
         return rate.window, force.window
 
     def release(self) -> None:
-        """Free what is kept beside the samples, some times as much; it is found anew if needed."""
-        for name in ("smoothed", "_every", "_every_edge"):
-            vars(self).pop(name, None)
+        """Free the smoothed signals of a long record; they are found anew if needed."""
+        if self.dt.size > _KEPT:
+            vars(self).pop("smoothed", None)
 
     @cached_property
     def smoothed(self) -> tuple[tuple[Smoothed, Smoothed], ...]:
