@@ -157,14 +157,16 @@ def test_motion_within_an_interval(sampling):
     assert np.abs(part.dv - gained).max() < 2e-8
 
 
-def test_what_was_smoothed_and_freed_is_the_same():
+def test_what_was_smoothed_and_freed_is_the_same(monkeypatch):
     inc, _ = increments(record(np.arange(1001) / 100.0))
     index, since = np.arange(100, 900), np.full(800, 0.004)
     expected = inc.partial(index, since)
     rates, forces = inc.smoothed[0]
     if rates.spline is not None and forces.spline is not None:
         assert forces.spline.t is rates.spline.t
+    monkeypatch.setattr("factorgraph_dvl.imu.increments._KEPT", 0)
     inc.release()
+    assert "smoothed" not in vars(inc)
     found = inc.partial(index, since)
     np.testing.assert_array_equal(found.omega, expected.omega)
     np.testing.assert_array_equal(found.force, expected.force)
