@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
+from factorgraph_dvl.graph.keys import calibration as calibration_key
 from factorgraph_dvl.graph.observation_rows import ObservationRows
-from factorgraph_dvl.graph.problem import Evaluation, Problem
+from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
@@ -22,11 +23,11 @@ from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.sensors.protocol import ObservationByRows
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
 from factorgraph_dvl.solvers.record_scores import record_scores
-from factorgraph_dvl.solvers.state_ranges import StateRanges, eliminated_by_ranges
-from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
-from factorgraph_dvl.statistics.scores import Score, Scores, scores
+from factorgraph_dvl.statistics.rows import rows_by_source
+from factorgraph_dvl.statistics.scores import Score
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Logarithm of the probability, shared among all tests, below which a misfit is no chance.
@@ -42,9 +43,9 @@ _FAR = 4.0
 _OUTSIDE = 5.0
 # Cost up to which a cause is as probable as the most probable one. Chosen: a likelihood of e^-4.
 _TIE = 4.0
-# Intervals whose scores show how much a misfit that a parameter does not explain scatters. Chosen:
-# longer than what persists in a trial of minutes.
-_INTERVALS = 20
+# Segments whose rows are there at a time. Chosen: those of an hour and a half; where many
+# parameters are free, they take 0.1 GB.
+_LONGEST = 5_000
 # Least scale of residuals against what is stated. Chosen: records without noise have none.
 _LEAST_SCALE = 0.5
 # Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the
@@ -190,15 +191,19 @@ def _tests(
     ]
     known += _shown_by_records(problem, evaluation, information)
     out = _tests_of_priors(problem, evaluation, information)
-    free = [*(p for p, _ in out.values()), *known]
-    if not free:
+    of_priors = [p for p, _ in out.values()]
+    if not known and not of_priors:
         return {}
-    ranges, columns = _freed(problem, evaluation, free)
-    found = scores(ranges.information.solution(), ranges.information, columns)
-    out |= {p.name: (p, found.test([p.name])) for p in known}
-    if all(test.log10_p >= _limit(p) for p, test in out.values()):
+    free = freed(problem, evaluation, information, known)
+    out |= {p.name: (p, free.scores.test([p.name])) for p in known}
+    ratios = _ratios(problem, evaluation)
+    # Scores scatter by no less than this.
+    least = min([1.0, *(float(np.min(ratio)) ** 2 for ratio in ratios.values())])
+    if all(test.divided(least).log10_p >= _limit(p) for p, test in out.values()):
         return out
-    scatter = _scatter(problem.chain.node_time, ranges, columns, found)
+    others = {p.name: (problem.key(p.name), wide(p, p.mean).sigma) for p in of_priors}
+    found, scatter = free.scattered(problem.chain.node_time, ratios, others)
+    out |= {p.name: (p, found.test([p.name])) for p in known}
     return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
 
 
@@ -213,7 +218,7 @@ def _shown_by_records(
     out: list[Parameter] = []
     if problem.chain.interpolates:
         return out
-    scattered = _as_scattered(problem, evaluation)
+    ratios = _ratios(problem, evaluation)
     known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
     for bound, at, motion in zip(
         problem.bound, evaluation.attached, evaluation.motions, strict=True
@@ -225,8 +230,7 @@ def _shown_by_records(
         here = replace(bound, attachment=at)
         priors = {p.name: wide(p, p.mean).sigma for p in own}
         found = record_scores(problem, here, evaluation, information, priors, motion)
-        ratio = scattered[label] / problem.noise_factors[label] if label in scattered else 1.0
-        variance = float(np.mean(np.square(ratio)))
+        variance = float(np.mean(np.square(ratios.get(label, 1.0))))
         for p in own:
             test = found.test([p.name]).divided(variance)
             if test.log10_p < _limit(p):
@@ -318,27 +322,66 @@ def wide(p: Parameter, mean: Array) -> Parameter:
     return replace(p, mean=mean, sigma=np.full(p.mean.size, p.spec.plausible * p.si))
 
 
-def _freed(
-    problem: Problem, evaluation: Evaluation, known: Sequence[Parameter]
-) -> tuple[StateRanges, dict[str, tuple[int, Array]]]:
-    """Return the problem with known parameters free, where it is, and their keys and priors.
+def freed(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    known: Sequence[Parameter],
+) -> ParameterScores:
+    """Return the scores of parameters that a problem takes as known, as it is weighed.
 
-    Its states are eliminated.
+    Parameters
+    ----------
+    problem, evaluation, information : Problem or Evaluation or SquareRootInformation
+        Problem, its minimum, and the information there.
+    known : sequence of Parameter
+        The parameters.
     """
     names = {p.name for p in known}
-    free = [wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
-    ranges = eliminated_by_ranges(
-        partial(
-            with_scattered_noise,
-            problem,
-            evaluation,
-            free,
-            noise=_as_scattered(problem, evaluation),
-        ),
-        problem.chain,
-        whole=bool(problem.processes),
-    )
-    return ranges, {p.name: (ranges.names[p.name], p.sigma) for p in free if p.name in names}
+    fixed = [p for p in problem.all_parameters if not p.estimated]
+    # Those that are estimated come first, and keep their keys.
+    every = [*problem.parameters, *(wide(p, p.mean) if p.name in names else p for p in fixed)]
+    columns = {
+        p.name: (calibration_key(i, p.mean.size), p.sigma)
+        for i, p in enumerate(p for p in every if p.estimated)
+        if p.name in names
+    }
+    candidates = {key for key, _ in columns.values()}
+    shared = {*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)}
+    noise = dict(problem.noise_factors)
+
+    def parts() -> Iterator[tuple[Problem, Iterator[Rows]]]:
+        for number, block in enumerate(_blocks(problem)):
+            part, at = with_scattered_noise(problem, evaluation, every, block, noise=noise)
+            # Priors of the candidates are none of the data; those of what all parts share count
+            # once.
+            left_out = candidates | shared if number else candidates
+            yield (
+                part,
+                (
+                    rows
+                    for rows in rows_by_source(part, at)
+                    if not left_out.issuperset(rows.keys[0].tolist())
+                ),
+            )
+
+    return parameter_scores(parts, columns, information)
+
+
+def _blocks(problem: Problem) -> list[slice | None]:
+    """Return segments whose rows are there at a time, None for all of them."""
+    count = problem.chain.count
+    parts = 1 if problem.processes else -(-count // _LONGEST)
+    if parts == 1:
+        return [None]
+    edges = np.linspace(0, count, parts + 1).astype(int)
+    return [slice(a, b) for a, b in pairwise(edges.tolist())]
+
+
+def _ratios(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:
+    """Return by what residuals differ from one to the next, over what they are weighed by."""
+    scattered = _as_scattered(problem, evaluation)
+    return {label: noise / problem.noise_factors[label] for label, noise in scattered.items()}
 
 
 def with_scattered_noise(
@@ -391,38 +434,6 @@ def with_scattered_noise(
     test.long_run = problem.long_run
     at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
     return test, test.weighed(at)
-
-
-def _scatter(
-    node_time: Array,
-    ranges: StateRanges,
-    columns: Mapping[str, tuple[int, Array]],
-    found: Scores,
-) -> dict[str, float]:
-    """Return how much more the scores of parts of the trial scatter than white noise makes them.
-
-    Once each parameter has explained what it can. Scores of a misfit that it does not explain, as
-    of correlated noise, go with each other for a while (White, Econometrica 48(4), 1980; Newey and
-    West, Econometrica 55(3), 1987).
-    """
-    # In units of the wide priors.
-    scaled = [{key: np.diag(1.0 / sigma)} for key, sigma in columns.values()]
-    gain = np.linalg.inv(ranges.information.covariance_of(scaled))
-    shared = {key: P @ gain for key, P in ranges.information.covariance_with(scaled).items()}
-    edges = np.linspace(node_time[0], node_time[-1], _INTERVALS + 1)[1:-1]
-    score, known = np.zeros((2, 1))
-    for rows, following in ranges.rows(shared):
-        of_range = by_interval(rows, following, edges)
-        score, known = score + of_range[0], known + of_range[1]
-    out = {}
-    for name, place in found.places.items():
-        own = known[:, place, place]
-        total = own.sum(axis=0) + np.eye(own.shape[1])
-        step = np.linalg.solve(total, score[:, place].sum(axis=0))
-        left = score[:, place] - own @ step
-        more = left.T @ left * _INTERVALS / (_INTERVALS - 1)
-        out[name] = max(1.0, float(np.trace(np.linalg.solve(total, more))) / step.size)
-    return out
 
 
 def _as_scattered(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:

@@ -34,19 +34,33 @@ def rows_by_source(problem: Problem, evaluation: Evaluation) -> Iterator[Rows]:
     yield from problem.observation_rows(evaluation)
 
 
-def rows_with_times(problem: Problem, every: Iterable[Rows]) -> Iterator[tuple[Rows, Array]]:
-    """Yield those of the rows by source that belong to times, with these: all but priors."""
+def rows_with_times(
+    problem: Problem, every: Iterable[Rows], priors: list[Rows] | None = None
+) -> Iterator[tuple[Rows, Array]]:
+    """Yield those of the rows by source that belong to times, with these: all but priors.
+
+    Parameters
+    ----------
+    problem : Problem
+        What they are rows of.
+    every : iterable of Rows
+        The rows.
+    priors : list of Rows, optional
+        Gets the others.
+    """
     when = {o.label: o.time for o in problem.observations}
     processes = {keys.letter_of(p.key(0)): p.time for p in problem.processes}
     node_time = problem.chain.node_time
     for rows in every:
         if rows.source in when:
             yield rows, when[rows.source][rows.begin : rows.begin + len(rows.vector)]
-        elif rows.keys.shape[1] > 1:
-            first = rows.keys[:, 0]
-            letter = keys.letter_of(int(first[0]))
-            if letter in keys.OF_NODES or letter in processes:
-                yield rows, processes.get(letter, node_time)[keys.indices_of(first)]
+            continue
+        first = rows.keys[:, 0]
+        letter = keys.letter_of(int(first[0]))
+        if rows.keys.shape[1] > 1 and (letter in keys.OF_NODES or letter in processes):
+            yield rows, processes.get(letter, node_time)[keys.indices_of(first)]
+        elif priors is not None:
+            priors.append(rows)
 
 
 def product(rows: Rows, columns: Mapping[int, Array]) -> Array:

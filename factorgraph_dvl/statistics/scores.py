@@ -104,6 +104,24 @@ class Scores:
         std = np.where(known, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.inf)
         return Score(float(self.score[rows] @ step), rows.size, step, std)
 
+    def with_variance(self, variance: Array) -> Scores:
+        """Return the scores where their variance is not the information, of each candidate alone.
+
+        The step is the same; its covariance is I⁻¹ M I⁻¹ with the variance M (White, Econometrica
+        48(4), 1980).
+
+        Parameters
+        ----------
+        variance : ndarray, shape (C, C)
+            M.
+        """
+        score, information = np.zeros_like(self.score), np.zeros_like(self.information)
+        for own in self.places.values():
+            known = self.information[own, own]
+            gain = known @ np.linalg.pinv(variance[own, own], _ROUNDING, hermitian=True)
+            score[own], information[own, own] = gain @ self.score[own], gain @ known
+        return Scores(self.places, score, information, self.wide)
+
 
 def scores(
     delta: gtsam.VectorValues,

@@ -1,0 +1,194 @@
+"""Scores of parameters that are taken as known, from the factorisation that there is.
+
+With the whitened rows of a problem at its minimum, A by its variables and J by such parameters,
+the residuals r, and the covariance P of the variables, all else follows the parameters as J̃:
+
+    J̃ = J - A P AᵀJ,    S = -J̃ᵀ r = -Jᵀ r,    I = J̃ᵀ J̃ = JᵀJ - JᵀA P AᵀJ.
+
+Where rows scatter by D, and not by one, S has the variance J̃ᵀ D² J̃ (White, Econometrica 48(4),
+1980).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.problem import Problem, Rows
+from factorgraph_dvl.statistics.constancy import by_interval
+from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_with_times
+from factorgraph_dvl.statistics.scores import Scores
+from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
+
+# Intervals whose scores show how much a misfit that a parameter does not explain scatters. Chosen:
+# longer than what persists in a trial of minutes.
+_INTERVALS = 20
+
+# Returns parts of a problem in which the parameters are free, each with its rows.
+Parts = Callable[[], Iterable[tuple[Problem, Iterator[Rows]]]]
+
+
+@dataclass(frozen=True)
+class ParameterScores:
+    """Scores of parameters that are taken as known, and how they follow.
+
+    Parameters
+    ----------
+    parts : callable
+        Returns parts of the problem in which these parameters are free, each with its rows.
+    columns : mapping of str to tuple of (int, ndarray)
+        Key there, and standard deviations (n,) of the wide prior, by name.
+    scores : Scores
+        Scores, and information as rows are whitened.
+    by_key : mapping of int to ndarray
+        JᵀA, (C, size) by key.
+    information : SquareRootInformation
+        Information on the variables of the problem without them.
+    """
+
+    parts: Parts
+    columns: Mapping[str, tuple[int, Array]]
+    scores: Scores
+    by_key: Mapping[int, Array]
+    information: SquareRootInformation
+
+    def scattered(
+        self, time: Array, ratios: Mapping[str, Array], others: Mapping[str, tuple[int, Array]]
+    ) -> tuple[Scores, dict[str, float]]:
+        """Return the scores where residuals scatter otherwise, and how much parts of them do.
+
+        Once each parameter has explained what it can, scores of a misfit that it does not explain,
+        as of correlated noise, go with each other for a while (White, Econometrica 48(4), 1980;
+        Newey and West, Econometrica 55(3), 1987).
+
+        Parameters
+        ----------
+        time : ndarray, shape (K,), s
+            Times of the nodes.
+        ratios : mapping of str to ndarray
+            Standard deviations (d,) of rows by label, where they are not one.
+        others : mapping of str to tuple of (int, ndarray)
+            Parameters that are variables: as `columns`.
+
+        Returns
+        -------
+        scores : Scores
+            The scores by that variance; one by one, the others being right.
+        scatter : dict of str to float
+            Variance of the scores of parts of the trial over what white noise makes of it, at
+            least one, by name; of `others` too.
+        """
+        following, places = self._following(others)
+        size = next(iter(following.values())).shape[1]
+        edges = np.linspace(time[0], time[-1], _INTERVALS + 1)[1:-1]
+        score, variance = np.zeros((_INTERVALS, size)), np.zeros((_INTERVALS, size, size))
+        of_priors = np.zeros((size, size))
+        for problem, every in self.parts():
+            priors: list[Rows] = []
+            rows = rows_with_times(problem, (_scaled(each, ratios) for each in every), priors)
+            of_part = by_interval(rows, following, edges)
+            score, variance = score + of_part[0], variance + of_part[1]
+            for each in priors:
+                J = product(each, following).reshape(-1, size)
+                of_priors += J.T @ J
+        whole = variance.sum(axis=0) + of_priors
+        out = {}
+        for name, place in places.items():
+            own = variance[:, place, place]
+            total = own.sum(axis=0) + np.eye(own.shape[1])
+            step = np.linalg.solve(total, score[:, place].sum(axis=0))
+            left = score[:, place] - own @ step
+            more = left.T @ left * _INTERVALS / (_INTERVALS - 1)
+            out[name] = max(1.0, float(np.trace(np.linalg.solve(total, more))) / step.size)
+        count, wide = self.scores.score.size, self.scores.wide
+        return self.scores.with_variance(whole[:count, :count] / np.outer(wide, wide)), out
+
+    def _following(
+        self, others: Mapping[str, tuple[int, Array]]
+    ) -> tuple[dict[int, Array], dict[str, slice]]:
+        """Return how every variable follows the parameters in units of their wide priors."""
+        moved = self.information.covariance_with([self.by_key])
+        unit = [{key: np.diag(1.0 / sigma)} for key, sigma in others.values()]
+        wide = self.scores.wide
+        places = dict(self.scores.places)
+        edge = wide.size
+        parts = [{key: -matrix * wide for key, matrix in moved.items()}]
+        for (name, (_, sigma)), each in zip(others.items(), unit, strict=True):
+            gain = np.linalg.inv(self.information.covariance_of([each]))
+            by_this = self.information.covariance_with([each])
+            parts.append({key: matrix @ gain for key, matrix in by_this.items()})
+            places[name] = slice(edge, edge + sigma.size)
+            edge += sigma.size
+        following = {key: np.hstack([part[key] for part in parts]) for key in moved}
+        for name, (key, sigma) in self.columns.items():
+            own = np.zeros((sigma.size, edge))
+            own[:, places[name]] = np.diag(sigma)
+            following[key] = own
+        return following, places
+
+
+def parameter_scores(
+    parts: Parts,
+    columns: Mapping[str, tuple[int, Array]],
+    information: SquareRootInformation,
+) -> ParameterScores:
+    """Return the scores of parameters that a problem takes as known.
+
+    Parameters
+    ----------
+    parts, columns, information : callable or mapping or SquareRootInformation
+        As of `ParameterScores`. Variables of the problem have the same keys in the parts.
+    """
+    sigma = np.concatenate([each for _, each in columns.values()])
+    edges = np.cumsum([0, *(each.size for _, each in columns.values())]).tolist()
+    places = {name: slice(*ends) for name, ends in zip(columns, pairwise(edges), strict=True)}
+    of_key = {key: places[name] for name, (key, _) in columns.items()}
+    score, square = np.zeros(sigma.size), np.zeros((sigma.size, sigma.size))
+    by_key: dict[int, Array] = {}
+    for _, every in parts():
+        for rows in every:
+            split = _split(rows, of_key, sigma.size)
+            if split is None:
+                continue
+            J, rest = split
+            add_transposed_product(rest, J, by_key)
+            flat = J.reshape(-1, sigma.size)
+            score -= flat.T @ rows.vector.ravel()
+            square += flat.T @ flat
+    known = square - information.covariance_of([by_key])
+    return ParameterScores(
+        parts, columns, Scores(places, score, known, sigma), by_key, information
+    )
+
+
+def _split(rows: Rows, of_key: Mapping[int, slice], count: int) -> tuple[Array, Rows] | None:
+    """Return the columns of parameters (M, d, C), and rows without; None where there are none."""
+    own = [of_key.get(key) for key in rows.keys[0].tolist()]
+    if not any(own):
+        return None
+    J = np.zeros((*rows.matrix.shape[:2], count))
+    edges = np.cumsum([0, *rows.sizes])
+    kept = [i for i, place in enumerate(own) if place is None]
+    for place, begin, end in zip(own, edges, edges[1:], strict=False):
+        if place is not None:
+            J[:, :, place] = rows.matrix[:, :, begin:end]
+    left = [rows.matrix[:, :, edges[i] : edges[i + 1]] for i in kept]
+    rest = replace(
+        rows,
+        keys=rows.keys[:, kept],
+        sizes=tuple(rows.sizes[i] for i in kept),
+        matrix=np.concatenate(left, axis=2),
+    )
+    return J, rest
+
+
+def _scaled(rows: Rows, ratios: Mapping[str, Array]) -> Rows:
+    """Return rows whose products have the variance that their residuals scatter by."""
+    ratio = ratios.get(rows.source)
+    if ratio is None:
+        return rows
+    return replace(rows, matrix=rows.matrix * ratio[:, None], vector=rows.vector / ratio)
