@@ -348,11 +348,10 @@ def freed(
     }
     candidates = {key for key, _ in columns.values()}
     shared = {*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)}
-    noise = dict(problem.noise_factors)
 
     def parts() -> Iterator[tuple[Problem, Iterator[Rows]]]:
         for number, block in enumerate(_blocks(problem)):
-            part, at = with_scattered_noise(problem, evaluation, every, block, noise=noise)
+            part, at = with_parameters(problem, evaluation, every, block)
             # Priors of the candidates are none of the data; those of what all parts share count
             # once.
             left_out = candidates | shared if number else candidates
@@ -385,19 +384,27 @@ def _ratios(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:
 
 
 def with_scattered_noise(
+    problem: Problem, evaluation: Evaluation, parameters: Sequence[Parameter]
+) -> tuple[Problem, Evaluation]:
+    """Return a problem with other parameters where it is, and noise as residuals scatter."""
+    test, at = with_parameters(problem, evaluation, parameters)
+    test.noise_factors = _as_scattered(problem, evaluation)
+    return test, test.weighed(at)
+
+
+def with_parameters(
     problem: Problem,
     evaluation: Evaluation,
     parameters: Sequence[Parameter],
     block: slice | None = None,
-    *,
-    noise: dict[str, Array] | None = None,
 ) -> tuple[Problem, Evaluation]:
-    """Return a problem with other parameters where it is, and noise as residuals scatter.
+    """Return a problem with other parameters where it is, and as it is weighed.
 
-    Of some segments only where a block of them is given; `noise` has its factors, if known.
+    Of some segments only where a block of them is given.
     """
     values = evaluation.parameters
     chain, observations, robust = problem.chain, problem.observations, problem.robust_weights
+    weights = dict(zip((o.label for o in observations), problem.weights, strict=True))
     if block is not None:
         own = [
             np.flatnonzero((at.segment >= block.start) & (at.segment < block.stop))
@@ -413,6 +420,7 @@ def with_scattered_noise(
             if index.size
         )
         robust = {label: weight[rows[label]] for label, weight in robust.items()}
+        weights = {label: weight[rows[label]] for label, weight in weights.items()}
     tilt = problem.tilt
     if tilt is not None:
         # It counts once, in the part that has the priors.
@@ -429,11 +437,12 @@ def with_scattered_noise(
         tilt=tilt,
     )
     test.reject(problem.rejected)
-    test.noise_factors = _as_scattered(problem, evaluation) if noise is None else noise
+    test.noise_factors = problem.noise_factors
     test.robust_weights = robust
     test.long_run = problem.long_run
-    at = test.evaluate(test.values(evaluation.states, test.prior_values() | values))
-    return test, test.weighed(at)
+    for bound in test.bound:
+        bound.weight = weights[bound.observation.label]
+    return test, test.evaluate(test.values(evaluation.states, test.prior_values() | values))
 
 
 def _as_scattered(problem: Problem, evaluation: Evaluation) -> dict[str, Array]:

@@ -16,7 +16,7 @@ from factorgraph_dvl.sensors.dvl import CURRENT
 from factorgraph_dvl.sensors.dvl_distortion import NAMES
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solved_problems
-from factorgraph_dvl.solvers.known_parameters import wide, with_scattered_noise
+from factorgraph_dvl.solvers.known_parameters import wide, with_parameters
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
 from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.statistics.scores import Scores, scores
@@ -62,8 +62,7 @@ def test_they_are_those_of_an_elimination_with_these_parameters_free():
     known = [p for p in problem.all_parameters if p.name in DISTORTIONS and not p.estimated]
     names = {p.name for p in known}
     free = [wide(p, p.mean) if p.name in names else p for p in problem.all_parameters]
-    same = dict(problem.noise_factors)
-    freed, at = with_scattered_noise(problem, evaluation, free, noise=same)
+    freed, at = with_parameters(problem, evaluation, free)
     information, delta = factorized(freed, at)
     columns = {p.name: (freed.key(p.name), p.sigma) for p in free if p.name in names}
     expected = scores(delta, information, columns)
