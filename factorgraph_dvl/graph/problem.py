@@ -58,7 +58,7 @@ __all__ = ["Evaluation", "Problem", "Rows"]
 FIXED_DIRECTION_STD = 1e-4
 # Relative change of a standard deviation from which on measurements are weighed anew. Chosen:
 # less hardly moves the minimum.
-_SAME_WEIGHT = 0.2
+SAME_WEIGHT = 0.2
 
 
 class Problem:
@@ -400,7 +400,7 @@ class Problem:
         """Whether standard deviations there are other than those that measurements count by."""
         for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
             used = weight > 0.0
-            if np.any(np.abs(bound.weight[used] / weight[used] - 1.0) > _SAME_WEIGHT):
+            if np.any(np.abs(bound.weight[used] / weight[used] - 1.0) > SAME_WEIGHT):
                 return True
         return False
 

@@ -6,13 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.keys import calibration as calibration_key
 from factorgraph_dvl.graph.observation_rows import ObservationRows
-from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
+from factorgraph_dvl.graph.problem import SAME_WEIGHT, Evaluation, Problem, Rows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
@@ -99,8 +100,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     time = problem.chain.node_time
     if time[-1] - time[0] < _SHORTEST:
         return None
-    evaluation, information = minimum.evaluation, minimum.information
-    tests = _tests(problem, evaluation, information)
+    weighed = _weighed(problem, minimum)
+    tests = _tests(problem, minimum, weighed)
     asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
     shared = np.log10(max(asked, 1))
     significant = [
@@ -110,8 +111,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     ]
     if not significant:
         return None
-    same, at = with_scattered_noise(problem, evaluation, problem.all_parameters)
-    changes = component_changes(same, at, factorized(same, at)[0])
+    changes = component_changes(weighed.problem, weighed.evaluation, weighed.information)
     certain = [e for e in changes if e.change.chi2 > CHANGED**2]
     significant.sort(key=lambda each: -evidence(*each))
     parameter, test = significant[0]
@@ -173,10 +173,40 @@ def _tests_of_priors(
     return out
 
 
+@dataclass(frozen=True)
+class _Weighed:
+    """A problem where it is, with what it is weighed by.
+
+    The step leads to its minimum, if it is not there. Ratios are those of what residuals scatter
+    by, where it is weighed otherwise.
+    """
+
+    problem: Problem
+    evaluation: Evaluation
+    information: SquareRootInformation
+    step: gtsam.VectorValues | None
+    ratios: dict[str, Array]
+
+
+def _weighed(problem: Problem, minimum: Minimum) -> _Weighed:
+    """Return a problem at its minimum: by what residuals scatter, if that is far from its weights.
+
+    Where one sensor does not fit, what its residuals have of the misfit would count as much as
+    what the others know.
+    """
+    evaluation = minimum.evaluation
+    ratios = _ratios(problem, evaluation)
+    if not any(np.any(np.abs(ratio - 1.0) > SAME_WEIGHT) for ratio in ratios.values()):
+        return _Weighed(problem, evaluation, minimum.information, None, ratios)
+    same, at = with_scattered_noise(problem, evaluation, problem.all_parameters)
+    return _Weighed(same, at, *factorized(same, at), {})
+
+
 def _tests(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem, minimum: Minimum, weighed: _Weighed
 ) -> dict[str, tuple[Parameter, Score]]:
     """Return tests of what is taken as known, within a prior or for certain, by name."""
+    evaluation, information = minimum.evaluation, minimum.information
     used = {
         name
         for o, weight in zip(problem.observations, problem.weights, strict=True)
@@ -194,9 +224,9 @@ def _tests(
     of_priors = [p for p, _ in out.values()]
     if not known and not of_priors:
         return {}
-    free = freed(problem, evaluation, information, known)
+    at, ratios = weighed.evaluation, weighed.ratios
+    free = freed(weighed.problem, at, weighed.information, known, weighed.step)
     out |= {p.name: (p, free.scores.test([p.name])) for p in known}
-    ratios = _ratios(problem, evaluation)
     # Scores scatter by no less than this.
     least = min([1.0, *(float(np.min(ratio)) ** 2 for ratio in ratios.values())])
     if all(test.divided(least).log10_p >= _limit(p) for p, test in out.values()):
@@ -327,15 +357,18 @@ def freed(
     evaluation: Evaluation,
     information: SquareRootInformation,
     known: Sequence[Parameter],
+    step: gtsam.VectorValues | None = None,
 ) -> ParameterScores:
     """Return the scores of parameters that a problem takes as known, as it is weighed.
 
     Parameters
     ----------
     problem, evaluation, information : Problem or Evaluation or SquareRootInformation
-        Problem, its minimum, and the information there.
+        Problem, where it is, and the information there.
     known : sequence of Parameter
         The parameters.
+    step : gtsam.VectorValues, optional
+        Step to the minimum, if it is not there.
     """
     names = {p.name for p in known}
     fixed = [p for p in problem.all_parameters if not p.estimated]
@@ -364,7 +397,7 @@ def freed(
                 ),
             )
 
-    return parameter_scores(parts, columns, information)
+    return parameter_scores(parts, columns, information, step)
 
 
 def _blocks(problem: Problem) -> list[slice | None]:

@@ -3,8 +3,9 @@
 With the whitened rows of a problem at its minimum, A by its variables and J by such parameters,
 the residuals r, and the covariance P of the variables, all else follows the parameters as J̃:
 
-    J̃ = J - A P AᵀJ,    S = -J̃ᵀ r = -Jᵀ r,    I = J̃ᵀ J̃ = JᵀJ - JᵀA P AᵀJ.
+    J̃ = J - A P AᵀJ,    S = -J̃ᵀ r = -Jᵀ (r + A d),    I = J̃ᵀ J̃ = JᵀJ - JᵀA P AᵀJ,
 
+with the step d to the minimum, -P Aᵀr.
 Where rows scatter by D, and not by one, S has the variance J̃ᵀ D² J̃ (White, Econometrica 48(4),
 1980).
 """
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
@@ -111,19 +113,20 @@ class ParameterScores:
         self, others: Mapping[str, tuple[int, Array]]
     ) -> tuple[dict[int, Array], dict[str, slice]]:
         """Return how every variable follows the parameters in units of their wide priors."""
-        moved = self.information.covariance_with([self.by_key])
-        unit = [{key: np.diag(1.0 / sigma)} for key, sigma in others.values()]
-        wide = self.scores.wide
-        places = dict(self.scores.places)
-        edge = wide.size
-        parts = [{key: -matrix * wide for key, matrix in moved.items()}]
-        for (name, (_, sigma)), each in zip(others.items(), unit, strict=True):
-            gain = np.linalg.inv(self.information.covariance_of([each]))
-            by_this = self.information.covariance_with([each])
+        information, wide = self.information, self.scores.wide
+        places, edge = dict(self.scores.places), self.scores.wide.size
+        parts = []
+        if self.by_key:
+            moved = information.covariance_with([self.by_key])
+            parts.append({key: -matrix * wide for key, matrix in moved.items()})
+        for name, (own_key, sigma) in others.items():
+            unit = {own_key: np.diag(1.0 / sigma)}
+            gain = np.linalg.inv(information.covariance_of([unit]))
+            by_this = information.covariance_with([unit])
             parts.append({key: matrix @ gain for key, matrix in by_this.items()})
             places[name] = slice(edge, edge + sigma.size)
             edge += sigma.size
-        following = {key: np.hstack([part[key] for part in parts]) for key in moved}
+        following = {key: np.hstack([part[key] for part in parts]) for key in parts[0]}
         for name, (key, sigma) in self.columns.items():
             own = np.zeros((sigma.size, edge))
             own[:, places[name]] = np.diag(sigma)
@@ -135,15 +138,18 @@ def parameter_scores(
     parts: Parts,
     columns: Mapping[str, tuple[int, Array]],
     information: SquareRootInformation,
+    step: gtsam.VectorValues | None = None,
 ) -> ParameterScores:
     """Return the scores of parameters that a problem takes as known.
 
     Parameters
     ----------
     parts, columns, information : callable or mapping or SquareRootInformation
-        As of `ParameterScores`. Variables of the problem have the same keys in the parts.
+        Those of `ParameterScores`. Variables of the problem have the same keys in the parts.
+    step : gtsam.VectorValues, optional
+        Step to the minimum, if the problem is not there.
     """
-    sigma = np.concatenate([each for _, each in columns.values()])
+    sigma = np.concatenate([np.zeros(0), *(each for _, each in columns.values())])
     edges = np.cumsum([0, *(each.size for _, each in columns.values())]).tolist()
     places = {name: slice(*ends) for name, ends in zip(columns, pairwise(edges), strict=True)}
     of_key = {key: places[name] for name, (key, _) in columns.items()}
@@ -159,7 +165,9 @@ def parameter_scores(
             flat = J.reshape(-1, sigma.size)
             score -= flat.T @ rows.vector.ravel()
             square += flat.T @ flat
-    known = square - information.covariance_of([by_key])
+    if step is not None:
+        score -= sum(matrix @ step.at(key) for key, matrix in by_key.items())
+    known = square - information.covariance_of([by_key]) if by_key else square
     return ParameterScores(
         parts, columns, Scores(places, score, known, sigma), by_key, information
     )

@@ -113,7 +113,7 @@ class Scores:
         Parameters
         ----------
         variance : ndarray, shape (C, C)
-            M.
+            The variance.
         """
         score, information = np.zeros_like(self.score), np.zeros_like(self.information)
         for own in self.places.values():
