@@ -17,7 +17,7 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.chain import Chain
 from factorgraph_dvl.graph.clocks import linearized, parameters_of, time_on_chain
 from factorgraph_dvl.graph.imu_errors import ImuErrors
-from factorgraph_dvl.graph.observation_rows import ObservationRows
+from factorgraph_dvl.graph.observation_rows import some_of
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.imu.window_means import by_motion_in_the_middle
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -26,7 +26,6 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
-    ObservationByRows,
     Window,
 )
 
@@ -119,13 +118,11 @@ class BoundObservation:
     def single(self, i: int) -> BoundObservation:
         """Return a measurement by itself, as if the nodes around it were the first two."""
         index = np.array([i])
-        whole = self.observation
-        own = whole.some(index) if isinstance(whole, ObservationByRows) else None
         chain = self.chain.from_node(self.chain.nodes_at(self.attachment)[i])
         errors = self.errors
         return replace(
             self,
-            observation=ObservationRows(whole, index) if own is None else own,
+            observation=some_of(self.observation, index),
             chain=chain,
             attachment=None,
             usable=self.usable[index],

@@ -14,6 +14,7 @@ from factorgraph_dvl.sensors.protocol import (
     Linearization,
     Motion,
     Observation,
+    ObservationByRows,
     ScaleWalk,
     SensorClock,
 )
@@ -121,3 +122,10 @@ class ObservationRows:
         source = np.zeros(self.whole.time.size, dtype=int)
         source[self.index] = np.arange(self.index.size)
         return rows_of(motion, source)
+
+
+def some_of(observation: Observation, index: IntArray) -> Observation:
+    """Return some measurements of an observation, (K,), taken apart where it can be."""
+    if isinstance(observation, ObservationByRows):
+        return observation.some(index)
+    return ObservationRows(observation, index)

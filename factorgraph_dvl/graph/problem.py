@@ -189,6 +189,11 @@ class Problem:
         """Inverse standard deviations of the observations, (M, d) each; 0 = not used."""
         return tuple(b.weight for b in self._bound)
 
+    @property
+    def used_count(self) -> int:
+        """Number of components that are used, of all measurements."""
+        return sum(int(np.count_nonzero(weight)) for weight in self.weights)
+
     @cached_property
     def clock_keys(self) -> list[int]:
         """Keys of the times that are estimated and move measurements along the chain.

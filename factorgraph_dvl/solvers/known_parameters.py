@@ -12,7 +12,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.keys import calibration as calibration_key
-from factorgraph_dvl.graph.observation_rows import ObservationRows
+from factorgraph_dvl.graph.observation_rows import ObservationRows, some_of
 from factorgraph_dvl.graph.problem import SAME_WEIGHT, Evaluation, Problem, Rows
 from factorgraph_dvl.imu.sampling import apparent_gyro_scale
 from factorgraph_dvl.message import Message, message
@@ -21,7 +21,6 @@ from factorgraph_dvl.plausibility.earlier_calibration import prior_against_data
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
-from factorgraph_dvl.sensors.protocol import ObservationByRows
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
@@ -116,8 +115,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     significant.sort(key=lambda each: -evidence(*each))
     parameter, test = significant[0]
     # A change costs as one component does of what there are as many of as measurements.
-    count = sum(int(np.count_nonzero(w)) for w in problem.weights)
-    more = test.chi2 - evidence(parameter, test) - float(np.log(count))
+    more = test.chi2 - evidence(parameter, test) - float(np.log(problem.used_count))
     fall = test.chi2 * test.scatter - more
     if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
         return None
@@ -446,9 +444,7 @@ def with_parameters(
         rows = {o.label: index for o, index in zip(observations, own, strict=True)}
         chain = chain.part(block)
         observations = tuple(
-            o.some(index)
-            if isinstance(o, ObservationByRows) and o.time.size > _FEW
-            else ObservationRows(o, index)
+            some_of(o, index) if o.time.size > _FEW else ObservationRows(o, index)
             for o, index in zip(observations, own, strict=True)
             if index.size
         )

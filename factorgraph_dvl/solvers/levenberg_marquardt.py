@@ -149,7 +149,7 @@ def minimise(
             hint="Inspect the trial: a unit or a column may be wrong",
         )
     if enough:
-        enough *= 0.5 * sum(np.count_nonzero(weights) for weights in problem.weights)
+        enough *= 0.5 * problem.used_count
     search = _Search(
         problem=problem,
         evaluation=evaluation,

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -23,7 +22,7 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_with_times
-from factorgraph_dvl.statistics.scores import Scores
+from factorgraph_dvl.statistics.scores import Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Intervals whose scores show how much a misfit that a parameter does not explain scatters. Chosen:
@@ -149,9 +148,8 @@ def parameter_scores(
     step : gtsam.VectorValues, optional
         Step to the minimum, if the problem is not there.
     """
-    sigma = np.concatenate([np.zeros(0), *(each for _, each in columns.values())])
-    edges = np.cumsum([0, *(each.size for _, each in columns.values())]).tolist()
-    places = {name: slice(*ends) for name, ends in zip(columns, pairwise(edges), strict=True)}
+    wide = {name: sigma for name, (_, sigma) in columns.items()}
+    sigma, places = np.concatenate([np.zeros(0), *wide.values()]), places_of(wide)
     of_key = {key: places[name] for name, (key, _) in columns.items()}
     score, square = np.zeros(sigma.size), np.zeros((sigma.size, sigma.size))
     by_key: dict[int, Array] = {}

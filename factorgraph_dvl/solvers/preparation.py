@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import msgspec
-import numpy as np
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
@@ -302,8 +301,7 @@ def mounted_start(
         )
         gross = problem.robust_weights = {}
         evaluation, iterations = problem.weighed(coarse.evaluation), coarse.iterations
-        count = sum(np.count_nonzero(weights) for weights in problem.weights)
-        if 2.0 * evaluation.cost > _GROSS * count:
+        if 2.0 * evaluation.cost > _GROSS * problem.used_count:
             gross, evaluation = robust_weights(problem, evaluation) or (gross, evaluation)
         states = evaluation.states
         assert prepared.trial.positioning is not None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
@@ -12,11 +11,11 @@ import numpy as np
 from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
-from factorgraph_dvl.graph.observation_rows import ObservationRows
+from factorgraph_dvl.graph.observation_rows import some_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
-from factorgraph_dvl.sensors.protocol import Motion, ObservationByRows
+from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.statistics.rows import add_transposed_product
-from factorgraph_dvl.statistics.scores import Scores
+from factorgraph_dvl.statistics.scores import Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Measurements whose derivatives are there at once. Chosen: some ten megabytes.
@@ -85,9 +84,8 @@ def record_scores(
     """
     sums = record_sums(problem, bound, evaluation, candidates, motion, derivatives)
     square = sums.square - information.covariance_of([sums.by_key])
-    edges = np.cumsum([0, *(sigma.size for sigma in candidates.values())]).tolist()
-    places = {name: slice(*ends) for name, ends in zip(candidates, pairwise(edges), strict=True)}
-    return Scores(places, sums.score, square, np.concatenate(list(candidates.values())))
+    wide = np.concatenate(list(candidates.values()))
+    return Scores(places_of(candidates), sums.score, square, wide)
 
 
 def record_sums(
@@ -180,9 +178,7 @@ def part_of(
         return replace(bound, attachment=at), motion
     part = replace(
         bound,
-        observation=whole.some(some)
-        if isinstance(whole, ObservationByRows)
-        else ObservationRows(whole, some),
+        observation=some_of(whole, some),
         attachment=rows_of(at, some),
         usable=bound.usable[some],
         weight=bound.weight[some],

@@ -247,9 +247,8 @@ def _first(start: Proposal, report: Progress) -> Estimated:
 
 def _is_lost(found: Estimated) -> bool:
     """Whether no minimum was reached, and residuals are larger than any noise."""
-    minimum, weights = found.minimum, found.problem.weights
-    count = sum(int(np.count_nonzero(weight)) for weight in weights)
-    return not minimum.converged and 2.0 * minimum.evaluation.cost > DO_NOT_FIT**2 * count
+    minimum, most = found.minimum, DO_NOT_FIT**2 * found.problem.used_count
+    return not minimum.converged and 2.0 * minimum.evaluation.cost > most
 
 
 def _is_hopeless(proposal: Proposal, at: Estimated) -> bool:

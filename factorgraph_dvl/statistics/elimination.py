@@ -91,53 +91,6 @@ def error_of_variance(
     return abs(x.dot(missing) - variance) / variance
 
 
-def eliminated_in_turn(
-    gaussian: gtsam.GaussianFactorGraph, order: Sequence[int], size: int
-) -> Iterator[tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]]:
-    """Yield the Bayes trees of one part of some variables after another, from QR.
-
-    Each elimination looks through the factors of its own part alone, not through all that are
-    left: that would take a time that grows with the square of their number.
-
-    Parameters
-    ----------
-    gaussian : gtsam.GaussianFactorGraph
-        All factors.
-    order : sequence of int
-        Keys of the variables in the order of elimination.
-    size : int
-        Number of variables of a part.
-
-    Yields
-    ------
-    tree : gtsam.GaussianBayesTree
-        What the elimination of a part leaves.
-    left : gtsam.GaussianFactorGraph
-        Factors without any of these variables: after the last part, all that are left.
-    """
-    part = {key: i // size for i, key in enumerate(order)}
-    count = -(-len(order) // size)
-    waiting = [gtsam.GaussianFactorGraph() for _ in range(count + 1)]
-
-    def distribute(graph: gtsam.GaussianFactorGraph) -> None:
-        for i in range(graph.size()):
-            factor = graph.at(i)
-            if factor is not None:
-                own = factor.keys()
-                first = min((part.get(key, count) for key in own), default=count)
-                waiting[first].push_back(factor)
-
-    distribute(gaussian)
-    # Factors that nobody else holds go once they are eliminated.
-    del gaussian
-    for k in range(count):
-        some = keys.ordering(order[k * size : (k + 1) * size])
-        tree, left = waiting[k].eliminatePartialMultifrontal(some, gtsam.EliminateQR)
-        waiting[k] = gtsam.GaussianFactorGraph()
-        distribute(left)
-        yield tree, waiting[count]
-
-
 def _trees(
     gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> Iterator[gtsam.GaussianBayesTree]:
@@ -146,4 +99,33 @@ def _trees(
     if count <= _MANY:
         return iter([gaussian.eliminateMultifrontal(ordering, gtsam.EliminateQR)])
     order = [ordering.at(i) for i in range(count)]
-    return (tree for tree, _ in eliminated_in_turn(gaussian, order, -(-count // _PARTS)))
+    return _in_turn(gaussian, order, -(-count // _PARTS))
+
+
+def _in_turn(
+    gaussian: gtsam.GaussianFactorGraph, order: Sequence[int], size: int
+) -> Iterator[gtsam.GaussianBayesTree]:
+    """Yield the Bayes trees of so many variables after the others, from QR.
+
+    Each elimination looks through the factors of its own part alone, not through all that are
+    left: that would take a time that grows with the square of their number.
+    """
+    part = {key: i // size for i, key in enumerate(order)}
+    waiting = [gtsam.GaussianFactorGraph() for _ in range(-(-len(order) // size))]
+
+    def distribute(graph: gtsam.GaussianFactorGraph) -> None:
+        for i in range(graph.size()):
+            factor = graph.at(i)
+            own = [] if factor is None else factor.keys()
+            if own:
+                waiting[min(part[key] for key in own)].push_back(factor)
+
+    distribute(gaussian)
+    # Factors that nobody else holds go once they are eliminated.
+    del gaussian
+    for k in range(len(waiting)):
+        some = keys.ordering(order[k * size : (k + 1) * size])
+        tree, left = waiting[k].eliminatePartialMultifrontal(some, gtsam.EliminateQR)
+        waiting[k] = gtsam.GaussianFactorGraph()
+        distribute(left)
+        yield tree

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-import gtsam
 import numpy as np
 from scipy.special import chdtrc
 
 from factorgraph_dvl.geometry.vectors import Array
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Relative size of an eigenvalue of information that is none.
 _ROUNDING = 1e-9
@@ -123,43 +122,7 @@ class Scores:
         return Scores(self.places, score, information, self.wide)
 
 
-def scores(
-    delta: gtsam.VectorValues,
-    information: SquareRootInformation,
-    candidates: Mapping[str, tuple[int, Array]],
-) -> Scores:
-    """Return scores and information of parameters that were taken as known.
-
-    The graph contains them as variables with a wide prior, linearised where the fit without them
-    ended, their priors' means being the values there. With P their covariance, the step delta
-    to the minimum, and Lambda the information of the priors,
-
-        I = P⁻¹ - Lambda,    S = P⁻¹ delta,    chi² = Sᵀ I⁻¹ S
-
-    (Rao, Large sample tests of statistical hypotheses, 1948; Engle, Wald, likelihood ratio, and
-    Lagrange multiplier tests in econometrics, 1984).
-
-    Parameters
-    ----------
-    delta : gtsam.VectorValues
-        Step to the minimum of the graph.
-    information : SquareRootInformation
-        Square-root information of the graph.
-    candidates : mapping of str to tuple of (int, ndarray)
-        Key and standard deviations (n,) of the wide prior, by name.
-    """
-    sizes = [sigma.size for _, sigma in candidates.values()]
-    edges = np.cumsum([0, *sizes])
-    P = information.covariance_of(
-        [{key: np.eye(sigma.size)} for key, sigma in candidates.values()]
-    )
-    sigma = np.concatenate([sigma for _, sigma in candidates.values()])
-    step = np.concatenate([delta.at(key) for key, _ in candidates.values()])
-    # In units of the wide priors, that parameters of all sizes keep their digits.
-    whole = np.linalg.inv(P / np.outer(sigma, sigma))
-    return Scores(
-        {name: slice(a, b) for name, a, b in zip(candidates, edges, edges[1:], strict=False)},
-        whole @ (step / sigma) / sigma,
-        (whole - np.eye(sigma.size)) / np.outer(sigma, sigma),
-        sigma,
-    )
+def places_of(wide: Mapping[str, Array]) -> dict[str, slice]:
+    """Return the components of each candidate among all, by name; arguments as `Scores.wide`."""
+    edges = np.cumsum([0, *(sigma.size for sigma in wide.values())]).tolist()
+    return {name: slice(*ends) for name, ends in zip(wide, pairwise(edges), strict=True)}

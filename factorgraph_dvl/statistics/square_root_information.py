@@ -239,22 +239,6 @@ class SquareRootInformation:
             x[each.frontals] = _upper(each.R, z)
         return ByKey(self._keys, self._first, x)
 
-    def following(self, known: Mapping[int, Array]) -> ByKey:
-        """Return how every variable follows others, on which the trees depend.
-
-        Parameters
-        ----------
-        known : mapping of int to ndarray
-            How the others follow n components, (size, n) by key.
-        """
-        x = np.zeros((self._first[-1], next(iter(known.values())).shape[1]))
-        for key, rows in known.items():
-            if key in self._rows:
-                x[self._rows[key]] = rows
-        for each in self._cliques:
-            x[each.frontals] = _upper(each.R, -each.T @ x[each.separators])
-        return ByKey(self._keys, self._first, x)
-
     def covariance_of(self, functionals: Sequence[Mapping[int, Array]]) -> Array:
         """Return the joint covariance of linear functionals of the variables.
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from freed_scores import scores
 from truth import TURNS_AND_BRAKING, config, merged, scenario
 
 from factorgraph_dvl.sensors.imu import ERRORS
@@ -17,7 +18,7 @@ from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.known_parameters import freed, wide, with_parameters
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
 from factorgraph_dvl.statistics.rows import product, rows_by_source
-from factorgraph_dvl.statistics.scores import Scores, scores
+from factorgraph_dvl.statistics.scores import Scores
 
 SCENE = {
     "noise": True,

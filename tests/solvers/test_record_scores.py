@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from freed_scores import scores
 from monte_carlo import RUNS
 from scipy.stats import chi2
 from truth import CONFIGS
@@ -19,7 +20,7 @@ from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.known_parameters import wide, with_parameters
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
 from factorgraph_dvl.solvers.record_scores import record_scores
-from factorgraph_dvl.statistics.scores import Scores, scores
+from factorgraph_dvl.statistics.scores import Scores
 
 DISTORTIONS = (CURRENT, *NAMES)
 # CPU of all of them on the cruise of 80 minutes, s.

@@ -12,7 +12,6 @@ from factorgraph_dvl.statistics import elimination
 from factorgraph_dvl.statistics.elimination import (
     cholesky,
     eliminated,
-    eliminated_in_turn,
     error_of_variance,
 )
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -79,18 +78,6 @@ def test_what_is_known_leaves_the_covariance_of_the_others(chain):
         np.testing.assert_allclose(joint, expected[np.ix_(rows, rows)], atol=1e-9)
     with pytest.raises(ValueError, match="after all others"):
         eliminated(graph, keys.ordering(order), sizes).given({4})
-
-
-def test_states_follow_what_they_share(chain):
-    """Trees of the states alone: a change of the constant moves them as the best ones go."""
-    graph, order, sizes, P, _, place = chain
-    parts = [tree for tree, _ in eliminated_in_turn(graph, order[:-1], 5)]
-    assert len(parts) > 2
-    following = SquareRootInformation(parts, sizes).following({SHARED: np.eye(SIZE)})
-    shared = place[SHARED]
-    for key in range(NODES):
-        expected = P[place[key], shared] @ np.linalg.inv(P[shared, shared])
-        np.testing.assert_allclose(following[key], expected, atol=1e-9)
 
 
 def test_a_variable_that_is_not_there_is_named_and_no_other_taken(chain):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
+from freed_scores import scores
 
-from factorgraph_dvl.statistics.scores import scores
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 WIDE = {"slope": (2, np.array([1e3])), "curve": (3, np.array([1e3])), "wave": (4, np.full(2, 1e3))}
