@@ -124,6 +124,8 @@ def correlated_noise(
                 factors[o.label] = np.where(share > 0.0, shown, white)
         if o.scale_walk is not None and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
+        if process is not None and problem.chain.interpolates and o.unit == "rad":
+            process = _beside_motion(process, when)
         if process is not None:
             processes.append(process)
     return CorrelatedNoise(tuple(processes), factors, long_run, gain, long_run_gain)
@@ -220,6 +222,19 @@ def _walking(
         nodes = node_times(time, tau, most, sigma)
         process = Process(label, index, np.zeros(sigma.size), np.ones(sigma.size), nodes)
     return replace(process, walk=walk)
+
+
+def _beside_motion(process: Process, time: Array) -> Process:
+    """Return an error of attitudes with nodes as far apart as its correlation time allows.
+
+    Without an IMU, close nodes follow the motion itself. Measured: with nodes every 8 s, a heading
+    error of 0.7 deg over 300 s took 64 off -2 log of the likelihood of four hours in a seaway, in
+    which there was none; with nodes every 100 s it adds 26.
+    """
+    active = process.sigma > 0.0
+    tau = float(process.tau[active].min())
+    nodes = node_times(time, tau, process.sigma[active], np.full(int(active.sum()), np.inf))
+    return replace(process, time=nodes)
 
 
 def _node_times(time: Array, sigma: Array, tau: Array, white: Array) -> Array:

@@ -49,6 +49,16 @@ def test_it_settles_near_the_truth(trial, settled):
         assert np.abs(off / sigma_of(settled, name)).max() < 5.0, name
 
 
+def test_lasting_errors_of_attitudes_leave_what_is_fast_to_the_motion():
+    """Nodes 8 s apart took the place of the motion in waves: 0.7 deg of heading, falsely."""
+    scenario = load_scenario(CONFIGS / "ship-water.yaml")
+    trial = simulate(msgspec.structs.replace(scenario, manoeuvres=[{"straight_s": 900}]), 0)
+    prepared = prepare_without_imu(trial)
+    settled = settle(prepared, prepared.states, lambda *_: None, roughly=True)
+    (lasting,) = (p for p in settled.problem.processes if p.label == "Attitude")
+    assert np.diff(lasting.time).min() > 0.3 * lasting.tau.min()
+
+
 def test_the_noise_is_found(settled):
     factors = settled.problem.noise_factors
     sigma = dict(
