@@ -413,7 +413,7 @@ def _different(*causes: Explanation | None) -> list[Explanation]:
 
 def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     """Yield what estimates a parameter instead, with noise as stated and as found."""
-    freed = _with_others(at, cause.freed)
+    freed = _with_others(at, *cause.freed)
     # What the misfit made of noise and gross errors is to be found anew.
     for model in (freed.as_stated(), freed):
         yield Proposal(model, at.states, at.values)
