@@ -25,8 +25,8 @@ from factorgraph_dvl.sensors.parameters import Parameter
 _PERIODS, _MEASUREMENTS = 4, 4
 # Lines of the spectrum that are folded. Chosen: sway makes others of each.
 _LINES = 3
-# Starts that are tried, first and last. Chosen: the last is known to a thousandth of a period.
-_STARTS = (64, 1024)
+# Starts that are tried, first to last. Chosen: at the end, a delay of 0.1 s is known to 0.1 ms.
+_STARTS = (64, 1024, 1024)
 # Periods that are tried around a line, and around the best of them.
 _AROUND = 21
 
@@ -75,8 +75,9 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
     if not lines.size:
         return None
     found = []
-    for width, starts in zip((1.0, 2.0 / _AROUND), _STARTS, strict=True):
-        tried = (lines[:, None] + width * np.linspace(-1.0, 1.0, _AROUND)).ravel()
+    for level, starts in enumerate(_STARTS):
+        around = (2.0 / _AROUND) ** level * np.linspace(-1.0, 1.0, _AROUND)
+        tried = (lines[:, None] + around).ravel()
         found = [_folded(since * (k / span), score, information, starts) for k in tried]
         best = int(np.argmax([fall for fall, _ in found]))
         lines = tried[best : best + 1]
