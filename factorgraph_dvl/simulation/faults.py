@@ -286,8 +286,8 @@ def dvl_water_track(
 ) -> Fault:
     """Measure against a layer of water, which a current, east, north, up, moves.
 
-    For a while; with an infinite duration, all the time. Or for a share of the record, from a third
-    of it on.
+    For a while; with an infinite duration, all the time. Or for a share of the record, from a
+    third of it on.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:

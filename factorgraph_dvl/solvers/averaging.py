@@ -61,7 +61,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
         if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
             continue
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
+        explains = share * found[cause] >= _SHARE * unexplained(bound, residual)
         # One-sided: lengths are above zero.
         shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
         if found[cause] > shown * scatter and explains:
@@ -70,7 +70,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
     return out
 
 
-def _misfit(bound: BoundObservation, residual: Array) -> float:
+def unexplained(bound: BoundObservation, residual: Array) -> float:
     """Return the squares of residuals beyond what they differ by from one to the next.
 
     Zero where it may be chance.

@@ -21,7 +21,7 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
-from factorgraph_dvl.solvers.record_scores import by_square, part_of, record_sums
+from factorgraph_dvl.solvers.record_scores import by_square, sums_in_parts
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -90,35 +90,23 @@ def _by_windows(
             continue
         if p.mean.any() or not bound.weight.any():
             continue
-        score, square, by_key = _by_window(problem, bound, evaluation, p.name)
-        moved = information.covariance_with([by_key])
-        taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in by_key.items())
-        known = max(square - taken_up, 0.0)
+        name = p.name
+
+        def by_length(part: BoundObservation, name: str = name) -> dict[str, Array]:
+            return {name: by_square(problem, part, evaluation)}
+
+        sums = sums_in_parts(problem, bound, evaluation, {name: np.full(1, np.inf)}, by_length)
+        moved = information.covariance_with([sums.by_key])
+        taken_up = sum(float((rows @ moved[key])[0, 0]) for key, rows in sums.by_key.items())
+        known = max(float(sums.square[0, 0]) - taken_up, 0.0)
         # Means over windows that share pings are rare.
         between = np.diff(np.unique(bound.observation.time))
         longest = min(p.spec.plausible, float(np.median(between)) if between.size else np.inf)
-        size = likely_square(score, known, longest)
+        size = likely_square(float(sums.score[0]), known, longest)
         changes = {key: -size * change for key, change in moved.items()}
         label = bound.observation.label
         upto = f"up to {np.sqrt(2.0 * size):.2g} s"
         yield ConsideredError(f"averaging of {label}", upto, changes)
-
-
-def _by_window(
-    problem: Problem, bound: BoundObservation, evaluation: Evaluation, name: str
-) -> tuple[float, float, dict[int, Array]]:
-    """Return -Jᵀ r, JᵀJ, and JᵀA by key, (1, size), of the square of a window's length."""
-    wide = {name: np.full(1, np.inf)}
-    score, square, by_key = 0.0, 0.0, dict[int, Array]()
-    count = bound.observation.time.size
-    for begin in range(0, count, _CHUNK):
-        part = part_of(bound, np.arange(begin, min(begin + _CHUNK, count)), evaluation)
-        squares = {name: by_square(problem, part, evaluation)}
-        sums = record_sums(problem, part, evaluation, wide, None, squares)
-        score, square = score + float(sums.score[0]), square + float(sums.square[0, 0])
-        for key, rows in sums.by_key.items():
-            by_key[key] = by_key[key] + rows if key in by_key else rows
-    return score, square, by_key
 
 
 def likely_square(score: float, information: float, plausible: float) -> float:

@@ -25,6 +25,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.solvers.sawtooth import sawtooths
 from factorgraph_dvl.solvers.state_ranges import StateRanges, eliminated_by_ranges
+from factorgraph_dvl.solvers.water_span import water_spans
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.scores import Score, Scores, scores
@@ -70,20 +71,20 @@ class Explanation:
     others : tuple of str or Message
         Names of those that explain the misfit about as well, `imu.sampling` where that does, and
         changes along the trial that do.
-    period : Parameter, optional
-        That of the parameter, if it is a sawtooth, as a search found it.
+    shape : Parameter, optional
+        What a search found of it: the period of a sawtooth, or the span of water.
     """
 
     parameter: Parameter
     score: Score
     others: tuple[str | Message, ...]
-    period: Parameter | None = None
+    shape: Parameter | None = None
 
     @property
     def freed(self) -> tuple[Parameter, ...]:
-        """The parameter, to be estimated, and its period."""
+        """The parameter, to be estimated, and its shape."""
         freed = wide(self.parameter, self.parameter.mean)
-        return (freed,) if self.period is None else (freed, self.period)
+        return (freed,) if self.shape is None else (freed, self.shape)
 
 
 def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanation | None:
@@ -104,8 +105,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     if time[-1] - time[0] < _SHORTEST:
         return None
     evaluation, information = minimum.evaluation, minimum.information
-    periods = sawtooths(problem, evaluation)
-    tests = _tests(problem, evaluation, information, periods)
+    shapes = sawtooths(problem, evaluation) | water_spans(problem, evaluation, information)
+    tests = _tests(problem, evaluation, information, shapes)
     asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
     shared = np.log10(max(asked, 1))
     significant = [
@@ -138,8 +139,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
-    period, _ = periods.get(parameter.name, (None, 0))
-    return Explanation(parameter, test, others, period)
+    shape, _ = shapes.get(parameter.name, (None, 0))
+    return Explanation(parameter, test, others, shape)
 
 
 def _limit(p: Parameter) -> float:
@@ -183,11 +184,11 @@ def _tests(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
-    periods: Mapping[str, tuple[Parameter, int]],
+    shapes: Mapping[str, tuple[Parameter, int]],
 ) -> dict[str, tuple[Parameter, Score]]:
     """Return tests of what is taken as known, within a prior or for certain, by name.
 
-    Of sawtooths, with the periods that a search found, by how many there were.
+    Of sawtooths and spans of water, with those that a search found, by how many there were.
     """
     used = {
         name
@@ -201,32 +202,30 @@ def _tests(
         if not (p.estimated or p.spec.plausible is None or p.spec.usual or p.spec.of_record)
         and p.name in used
     ]
-    known += _shown_by_records(problem, evaluation, information, periods)
+    known += _shown_by_records(problem, evaluation, information, shapes)
     out = _tests_of_priors(problem, evaluation, information)
     free = [*(p for p, _ in out.values()), *known]
     if not free:
         return {}
-    ranges, columns = _freed(problem, evaluation, free, [p for p, _ in periods.values()])
+    ranges, columns = _freed(problem, evaluation, free, [p for p, _ in shapes.values()])
     found = scores(ranges.information.solution(), ranges.information, columns)
-    out |= {p.name: (p, _searched(found.test([p.name]), p, periods)) for p in known}
+    out |= {p.name: (p, _searched(found.test([p.name]), p, shapes)) for p in known}
     if all(test.log10_p >= _limit(p) for p, test in out.values()):
         return out
     scatter = _scatter(problem.chain.node_time, ranges, columns, found)
     return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
 
 
-def _searched(
-    test: Score, p: Parameter, periods: Mapping[str, tuple[Parameter, int]]
-) -> Score:
-    """Return a test as that of the best of all periods, if it is one of a sawtooth."""
-    return test.searched(periods[p.name][1]) if p.name in periods else test
+def _searched(test: Score, p: Parameter, shapes: Mapping[str, tuple[Parameter, int]]) -> Score:
+    """Return a test as that of the best of all shapes, if its parameter has one."""
+    return test.searched(shapes[p.name][1]) if p.name in shapes else test
 
 
 def _shown_by_records(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
-    periods: Mapping[str, tuple[Parameter, int]],
+    shapes: Mapping[str, tuple[Parameter, int]],
 ) -> list[Parameter]:
     """Return the parameters of one record each that its rows ask for.
 
@@ -237,8 +236,8 @@ def _shown_by_records(
     if problem.chain.interpolates:
         return out
     scattered = _as_scattered(problem, evaluation)
-    of_periods = {p.name: p.mean for p, _ in periods.values()}
-    there = replace(evaluation, parameters={**evaluation.parameters, **of_periods})
+    own_shapes = {p.name: p.mean for p, _ in shapes.values()}
+    there = replace(evaluation, parameters={**evaluation.parameters, **own_shapes})
     known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
     for bound, at, motion in zip(
         problem.bound, evaluation.attached, evaluation.motions, strict=True
@@ -253,7 +252,7 @@ def _shown_by_records(
         ratio = scattered[label] / problem.noise_factors[label] if label in scattered else 1.0
         variance = float(np.mean(np.square(ratio)))
         for p in own:
-            test = _searched(found.test([p.name]).divided(variance), p, periods)
+            test = _searched(found.test([p.name]).divided(variance), p, shapes)
             if test.log10_p < _limit(p):
                 out.append(p)
     return out
@@ -284,7 +283,7 @@ def explanation_findings(
                 std=_uncertainty(e.parameter),
                 chi2=_chi_square(e),
                 value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
-                others=_leap_seconds(e.parameter, evaluation) or _sawtooth(e) or _or(e),
+                others=_leap_seconds(e.parameter, evaluation) or _shape(e) or _or(e),
             ),
             parameter=e.parameter.name,
         )
@@ -317,11 +316,13 @@ def _leap_seconds(p: Parameter, evaluation: Evaluation) -> Message | None:
     return message("leap_seconds.estimated") if abs(off - LEAP_SECONDS) < 1.0 else None
 
 
-def _sawtooth(found: Explanation) -> Message | None:
-    """Return what a delay that rises and falls back is, None if it is another parameter."""
-    if found.period is None:
+def _shape(found: Explanation) -> Message | None:
+    """Return what a parameter is that has a shape, None if it has none."""
+    if found.shape is None:
         return None
-    return message("sawtooth.estimated", period=found.period.mean[0])
+    values = dict(zip(found.shape.spec.labels, found.shape.mean, strict=True))
+    key = "sawtooth.estimated" if "period" in values else "water_span.estimated"
+    return message(key, **values)
 
 
 def _uncertainty(p: Parameter) -> Message:
@@ -354,14 +355,14 @@ def _freed(
     problem: Problem,
     evaluation: Evaluation,
     known: Sequence[Parameter],
-    periods: Iterable[Parameter],
+    shapes: Iterable[Parameter],
 ) -> tuple[StateRanges, dict[str, tuple[int, Array]]]:
     """Return the problem with known parameters free, where it is, and their keys and priors.
 
     Its states are eliminated.
     """
     names = {p.name for p in known}
-    others = {p.name: p for p in periods}
+    others = {p.name: p for p in shapes}
     free = [
         wide(p, p.mean) if p.name in names else others.get(p.name, p)
         for p in problem.all_parameters

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
@@ -124,6 +124,26 @@ def record_sums(
         score -= flat.T @ residual.ravel()
         square += flat.T @ flat
     return RecordSums(score, square, taken_up)
+
+
+def sums_in_parts(
+    problem: Problem,
+    bound: BoundObservation,
+    evaluation: Evaluation,
+    candidates: Mapping[str, Array],
+    derivatives: Callable[[BoundObservation], Mapping[str, Array]],
+) -> RecordSums:
+    """Return `record_sums` of a long record, with derivatives that are made for part of it."""
+    size = sum(sigma.size for sigma in candidates.values())
+    score, square, by_key = np.zeros(size), np.zeros((size, size)), dict[int, Array]()
+    count = bound.observation.time.size
+    for begin in range(0, count, _CHUNK):
+        part = part_of(bound, np.arange(begin, min(begin + _CHUNK, count)), evaluation)
+        sums = record_sums(problem, part, evaluation, candidates, None, derivatives(part))
+        score, square = score + sums.score, square + sums.square
+        for key, rows in sums.by_key.items():
+            by_key[key] = by_key[key] + rows if key in by_key else rows
+    return RecordSums(score, square, by_key)
 
 
 def window_part(bound: BoundObservation, evaluation: Evaluation) -> tuple[BoundObservation, float]:

@@ -10,7 +10,6 @@ near the period; folded by a period P, s and w show the sawtooth g with the high
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
