@@ -477,7 +477,7 @@ ROWS = (
         "m/s",
         (0.1, 0.3),
         lambda x: [f.dvl_water_track((0.8 * x, 0.6 * x, 0.0), share=1 / 3)],
-        (gross("DVL"), r"^changed_along_trial[^:]*(dvl|scale|misalignment)", "water"),
+        (r"water_current", gross("DVL")),
     ),
     Row("IMU: gyros late", "s", (0.002, 0.01), lambda x: [g.gyros_late(x)], (r"gyro_delay",)),
     Row("IMU: gyros filtered", "s", (0.005, 0.03), lambda x: [g.gyros_lag(x)], (r"gyro_delay",)),

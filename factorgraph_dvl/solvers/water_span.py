@@ -1,12 +1,13 @@
 """Water in place of the bottom for part of a trial: the span that the scores of pings show.
 
-In each of some blocks of the record a DVL may see water that moves with a current of its own. With
-S the scores of these currents and I their information, all else following, one current from block
-i to block j takes off the objective
+Where a DVL begins to see water that moves, the current that each ping asks for steps, and the IMU
+knows of no such step. Between the largest steps are blocks of pings. With S the scores of a
+current of each block and I their information, all else following, one current from block i to
+block j takes off the objective
 
     S_ijᵀ I_ij⁻¹ S_ij,    S_ij = sum S_k,    I_ij = sum I_kl,    i <= k, l <= j.
 
-The span is where this is highest. Then the blocks at its ends are divided in turn.
+The span is where this is highest.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.dvl import CURRENT, WATER, WATER_SPAN
@@ -24,8 +25,9 @@ from factorgraph_dvl.solvers.averaging import unexplained
 from factorgraph_dvl.solvers.record_scores import sums_in_parts
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
-# Blocks of a record, and those into which the ones at the ends of a span are divided.
-_BLOCKS = 20
+# Steps that are looked at, and pings on each side that show one. Chosen: a span has two, other
+# errors some more; noise of a DVL is averaged, and the IMU drifts by less.
+_STEPS, _SIDE = 8, 30
 # Share of the largest eigenvalue of information that is known. Chosen: rounding is less.
 _KNOWN = 1e-9
 
@@ -45,26 +47,41 @@ def water_spans(
     known = {p.name: p for p in problem.all_parameters}
     out: dict[str, tuple[Parameter, int]] = {}
     for bound, residual in zip(problem.bound, evaluation.residuals, strict=True):
-        time = np.unique(bound.observation.time[bound.weight.any(axis=1)])
+        time = bound.observation.time
         if (
-            WATER not in bound.observation.parameters
-            or known[WATER].estimated
-            or time.size < _BLOCKS**2
-            or unexplained(bound, residual) == 0.0
+            WATER in bound.observation.parameters
+            and not known[WATER].estimated
+            and time.size > 4 * _SIDE
+            and unexplained(bound, residual) > 0.0
         ):
-            continue
-        first, last, edges = 0, 0, np.linspace(time[0], time[-1], _BLOCKS + 1)
-        for finer in (False, True):
-            if finer:
-                ends = [
-                    edges[[k, k + 1]]
-                    for k in {max(first - 1, 0), first, last, min(last + 1, edges.size - 2)}
-                ]
-                edges = np.unique([*edges, *(np.linspace(*end, _BLOCKS // 2 + 1) for end in ends)])
-            first, last = _best(*_by_block(problem, bound, evaluation, information, edges))
-        span = np.array([edges[first], edges[last + 1]])
-        out[WATER] = replace(known[WATER_SPAN], mean=span), (10 * _BLOCKS) ** 2 // 2
+            first = _first_pings(problem, bound, evaluation)
+            i, j = _best(*_by_block(problem, bound, evaluation, information, time[first[1:-1]]))
+            span = np.array([time[first[i]], time[first[j + 1] - 1]])
+            # It may begin and end with any ping.
+            out[WATER] = replace(known[WATER_SPAN], mean=span), time.size**2 // 2
     return out
+
+
+def _first_pings(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> IntArray:
+    """Return the first ping of each block, and the number of pings, in order."""
+    values = evaluation.parameters
+    attached = replace(bound, attachment=bound.attached(values))
+    motion = attached.motion(attached.attachment, evaluation.states, values)
+    lin = attached.linearized(motion, values, [CURRENT], problem.processes_of(bound))
+    # Columns are orthogonal, and of unit length but for the scale.
+    asked = -np.einsum("mdi,md->mi", lin.d_parameters[CURRENT], lin.residual)
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(asked, axis=0)])
+    count, n = len(asked), _SIDE
+    step = sums[2 * n :] - 2.0 * sums[n : count + 1 - n] + sums[: count + 1 - 2 * n]
+    size = np.linalg.norm(step, axis=1)
+    found = []
+    for _ in range(_STEPS):
+        at = int(np.argmax(size))
+        if size[at] <= 0.0:
+            break
+        found.append(at + n)
+        size[max(at - n, 0) : at + n] = 0.0
+    return np.array([0, *sorted(found), count])
 
 
 def _by_block(
@@ -72,16 +89,16 @@ def _by_block(
     bound: BoundObservation,
     evaluation: Evaluation,
     information: SquareRootInformation,
-    edges: Array,
+    starts: Array,
 ) -> tuple[Array, Array]:
     """Return scores (K, 2) and information (K, 2, K, 2) of a current of each block of pings."""
-    count = edges.size - 1
+    count = starts.size + 1
 
     def by_blocks(part: BoundObservation) -> dict[str, Array]:
         values, own = evaluation.parameters, part.observation.time
         motion = part.motion(part.attachment, evaluation.states, values)
         lin = part.linearized(motion, values, [CURRENT], problem.processes_of(part))
-        block = np.clip(np.searchsorted(edges, own, side="right") - 1, 0, count - 1)
+        block = np.searchsorted(starts, own, side="right")
         by_current = lin.d_parameters[CURRENT]
         out = np.zeros((*by_current.shape[:2], count, 2))
         out[np.arange(own.size), :, block] = by_current
