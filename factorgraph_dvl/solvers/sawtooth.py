@@ -70,7 +70,7 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
     power = np.abs(np.fft.rfft(series)) ** 2
     # Line k has k periods in the trial.
     last = min(power.size, stamps.size // _MEASUREMENTS)
-    lines = _PERIODS + np.argsort(power[_PERIODS:last])[-_LINES:]
+    lines = float(_PERIODS) + np.argsort(power[_PERIODS:last])[-_LINES:]
     if not lines.size:
         return None
     found = []

@@ -86,7 +86,7 @@ def test_stamps_rise_and_fall_back(trial):
 
 
 def test_a_compass_deviates_by_its_heading(trial):
-    reference = replace(trial.reference, rph=trial.reference.rph + [0.0, 0.0, 0.5 * np.pi])
+    reference = replace(trial.reference, rph=trial.reference.rph + 0.5 * np.pi * np.eye(3)[2])
     turned = replace(trial, reference=reference)
     (compass,) = with_faults(turned, [g.compass_deviates((3.0, 1.0, 1.0, 2.0), 0.0)]).others
     # At 90 deg: 3 - 2.
