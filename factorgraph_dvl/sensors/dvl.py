@@ -31,6 +31,14 @@ from factorgraph_dvl.sensors.dvl_distortion import (
     Distortion,
     is_distorted,
 )
+from factorgraph_dvl.sensors.dvl_water import (
+    CURRENT,
+    CURRENT_SPEC,
+    WATER,
+    WATER_SPAN,
+    WATER_SPAN_SPEC,
+    WATER_SPEC,
+)
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -67,22 +75,12 @@ LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
 AVERAGING_SPEC = averaging_spec()
-# Plausible size, m/s. Chosen: tides and ocean currents.
-CURRENT_SPEC = ParameterSpec(
-    "current", "m_s", labels=("e", "n"), frame="n", plausible=0.5, of_record=True
-)
-# Of water that is seen in place of the bottom for a while: its current, and the first and the last
-# stamp, which a search finds.
-WATER_SPEC = replace(CURRENT_SPEC, stem="water_current", nuisance=True)
-WATER_SPAN_SPEC = ParameterSpec("water_span", "s", labels=("first", "last"), nuisance=True)
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
 SCALE_ERROR = SCALE_SPEC.name
 LEVER_ARM = LEVER_ARM_SPEC.name
 BIAS = BIAS_SPEC.name
 TIME_OFFSET = CLOCK.offset.name
-CURRENT = CURRENT_SPEC.name
-WATER, WATER_SPAN = WATER_SPEC.name, WATER_SPAN_SPEC.name
 AVERAGING = AVERAGING_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.

@@ -98,7 +98,7 @@ def compass_deviates(deviation_deg: Sequence[float], std_deg: float = 0.2) -> Fa
     deviation_deg : sequence of float, shape (4,)
         Amplitudes of sine and cosine of the heading, and of twice the heading.
     std_deg : float, default 0.2
-        Of the white noise of each heading.
+        Standard deviation of the white noise of each heading.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:

@@ -39,7 +39,7 @@ class Sawtooth:
     period, start : float, s
         Its period, and a stamp at which one begins.
     fall : float
-        By how much the squares of the residuals fall, nothing else following.
+        Fall of the squares of the residuals, nothing else following.
     tried : int
         Periods and starts that could have been it.
     """

@@ -19,7 +19,7 @@ import numpy as np
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.sensors.dvl import CURRENT, WATER, WATER_SPAN
+from factorgraph_dvl.sensors.dvl_water import CURRENT, WATER, WATER_SPAN
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solvers.averaging import unexplained
 from factorgraph_dvl.solvers.record_scores import sums_in_parts

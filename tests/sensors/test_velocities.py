@@ -137,7 +137,7 @@ def test_dvl_velocity_jacobians(scale, misalignment):
     }
     # Less bends too much for a numerical derivative.
     distorted["dvl_truncation_m_s"] = np.array([0.3])
-    check_jacobians(o, random_motion(), distorted, dvl.parameters())
+    check_jacobians(o, random_motion(), distorted, dvl.parameters(), tolerance=3e-8)
 
 
 DISTORTED = {
