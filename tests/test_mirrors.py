@@ -14,6 +14,7 @@ TESTS = Path(__file__).parent
 # tested instead: they are parts of one thing, or stand behind a command or a catalogue.
 ELSEWHERE = {
     "sensors/averaging": "solvers/test_averaging.py",
+    "sensors/dvl_water": "solvers/test_water_span.py",
     "baselines/beam_calibration": "sensors/test_dvl_beams.py",
     "baselines/spurious_information": "baselines/test_calibration.py",
     "baselines/star_calibration": "sensors/test_star.py",

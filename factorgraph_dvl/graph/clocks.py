@@ -71,11 +71,11 @@ def linearized(
 ) -> Linearization:
     """Return residual and Jacobians of measurements, those of clock and window included.
 
-    With the lag o + r (t - t0) of the stamps,
+    With the lag l of the stamps, which is o + r (t - t0) and more,
 
         dρ/do = -(dρ/dθ ω_eb + dρ/dp v + dρ/dv a + dρ/dω α),    dρ/dr = (t - t0) dρ/do,
 
-    and a delay of some measurements beside their clock has the same derivative as its offset.
+    and of any other parameter of the clock, dl/dc dρ/do.
 
     Nodes that move with a clock of lag n have dρ/dn = -dρ/do, for all measurements; where their
     attitudes have a clock of their own, each of both takes its terms.
@@ -122,11 +122,11 @@ def linearized(
             if mean is None
             else by_change((lin.d_v, mean.v_by_length), (lin.d_omega, mean.omega_by_length))
         )
-    since = (observation.time - zero)[:, None, None]
-    for name, by in zip(own, (-by_time, -by_time * since, -by_time), strict=False):
-        if name in wanted:
+    if observation.clock is not None and not set(own).isdisjoint(wanted):
+        by_name = observation.clock.by_parameters(observation.time, values, zero)
+        for name in set(own) & {*wanted}:
             # A measurement from another vessel knows itself how that one moves.
-            found[name] = found.get(name, 0.0) + by
+            found[name] = found.get(name, 0.0) - by_time * by_name[name][:, None, None]
     for of_chain, by in ((clock, moving), (attitude_clock or clock, turning)):
         if of_chain is not None and of_chain in wanted:
             found[of_chain] = found.get(of_chain, 0.0) + by

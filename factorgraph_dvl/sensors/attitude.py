@@ -53,8 +53,13 @@ _APART = 2.0
 
 HEADING_OFFSET_SPEC = ParameterSpec("heading_offset", "deg", labels=SCALAR, kind="angle")
 SCHULER_SPEC = ParameterSpec("heading_schuler", "deg", labels=("cos", "sin"), nuisance=True)
+# Plausible deviation, deg. Chosen: that of a compass near steel that nobody compensated.
 DEVIATION_SPEC = ParameterSpec(
-    "compass_deviation", "deg", labels=("sin_1", "cos_1", "sin_2", "cos_2"), nuisance=True
+    "compass_deviation",
+    "deg",
+    labels=("sin_1", "cos_1", "sin_2", "cos_2"),
+    nuisance=True,
+    plausible=3.0,
 )
 _CLOCK = Clock.of("attitude", prefix="attitude_")
 

@@ -18,6 +18,8 @@ from factorgraph_dvl.settings.sections import NonNegative
 # of GPS time, and the second is quartz that is broken.
 _OFFSET_S = 5.0
 _RATE_PPM = 1000.0
+# Plausible delay, s, that a buffer makes. Chosen: some pings.
+_SAWTOOTH_S = 0.2
 # How names of offset and rate end, without the unit.
 CLOCK_STEMS = ("time_offset", "clock_rate")
 
@@ -42,18 +44,25 @@ class ClockSection(SensorSection, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Clock:
-    """What the stamps of a sensor depend on: stamp = t + offset + rate (t - zero).
+    """What the stamps of a sensor depend on: stamp = t + offset + rate (t - zero) + delay.
 
-    `zero` is the middle of the trial, so that offset and rate do not depend on each other.
+    `zero` is the middle of the trial, so that offset and rate do not depend on each other. The
+    delay is that of a buffer that fills and is emptied: a sawtooth of the stamp, zero on average.
 
     Parameters
     ----------
     offset, rate : ParameterSpec
         Offset, s, and rate, ppm, of the sensor's clock.
+    sawtooth : ParameterSpec
+        How much longer the delay is at the end of a period than at its start, s.
+    period : ParameterSpec
+        The period, and the stamp at which one begins, s. A search finds them: they are known.
     """
 
     offset: ParameterSpec
     rate: ParameterSpec
+    sawtooth: ParameterSpec
+    period: ParameterSpec
 
     @classmethod
     def of(cls, sensor: str, *, prefix: str = "") -> Clock:
@@ -64,20 +73,31 @@ class Clock:
         rate = ParameterSpec(
             f"{sensor}_clock_rate", "ppm", labels=SCALAR, nuisance=True, plausible=_RATE_PPM
         )
-        return cls(offset, rate)
+        sawtooth = ParameterSpec(
+            f"{sensor}_sawtooth_delay",
+            "s",
+            labels=SCALAR,
+            nuisance=True,
+            plausible=_SAWTOOTH_S,
+            of_record=True,
+        )
+        period = ParameterSpec(
+            f"{sensor}_sawtooth", "s", labels=("period", "start"), nuisance=True
+        )
+        return cls(offset, rate, sawtooth, period)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of offset and rate."""
-        return self.offset.name, self.rate.name
+        """Names of offset, rate and sawtooth."""
+        return self.offset.name, self.rate.name, self.sawtooth.name
 
     @property
-    def specs(self) -> tuple[ParameterSpec, ParameterSpec]:
-        """What offset and rate are."""
-        return self.offset, self.rate
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """What offset, rate, sawtooth and its period are."""
+        return self.offset, self.rate, self.sawtooth, self.period
 
-    def parameters(self, settings: ClockSection) -> tuple[Parameter, Parameter]:
-        """Return offset and rate with the priors of the settings."""
+    def parameters(self, settings: ClockSection) -> tuple[Parameter, ...]:
+        """Return offset and rate with the priors of the settings, and no sawtooth."""
         rate_sigma = settings.clock_rate_std_ppm * self.rate.si
         return (
             Parameter(
@@ -86,6 +106,8 @@ class Clock:
                 np.array([settings.time_offset_std_s]),
             ),
             Parameter(self.rate, np.zeros(1), np.array([rate_sigma])),
+            Parameter(self.sawtooth, np.zeros(1), np.zeros(1)),
+            Parameter(self.period, np.zeros(2), np.zeros(2)),
         )
 
     def lag(self, time: Array, values: Mapping[str, Array], zero: float) -> Array:
@@ -96,12 +118,29 @@ class Clock:
         time : ndarray, shape (M,), s
             Stamps.
         values : mapping of str to ndarray
-            Offset and rate by name, SI.
+            Offset and rate by name, SI, and the sawtooth where there is one.
         zero : float, s
             When the offset is valid.
         """
         offset, rate = float(values[self.offset.name][0]), float(values[self.rate.name][0])
-        return offset + rate * (time - zero)
+        out = offset + rate * (time - zero)
+        delay = values.get(self.sawtooth.name)
+        return out if delay is None or not delay[0] else out + delay[0] * self._rise(time, values)
+
+    def by_parameters(
+        self, time: Array, values: Mapping[str, Array], zero: float
+    ) -> dict[str, Array]:
+        """Return the derivatives of the lag, (M,) by name; arguments are those of `lag`."""
+        return {
+            self.offset.name: np.ones(time.size),
+            self.rate.name: time - zero,
+            self.sawtooth.name: self._rise(time, values),
+        }
+
+    def _rise(self, time: Array, values: Mapping[str, Array]) -> Array:
+        """Return the share of the sawtooth at each stamp, from -1/2 to 1/2, (M,)."""
+        period, start = values.get(self.period.name, np.zeros(2))
+        return np.mod((time - start) / period, 1.0) - 0.5 if period > 0.0 else np.zeros(time.size)
 
 
 @dataclass(frozen=True)
@@ -110,8 +149,8 @@ class LateClock(Clock):
 
     Parameters
     ----------
-    offset, rate : ParameterSpec
-        Offset, s, and rate, ppm, of the sensor's clock.
+    offset, rate, sawtooth, period : ParameterSpec
+        Those of the sensor's clock.
     delay : ParameterSpec
         What their stamps are late by, s, beside the offset.
     """
@@ -120,12 +159,19 @@ class LateClock(Clock):
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of offset, rate and delay."""
-        return self.offset.name, self.rate.name, self.delay.name
+        """Names of offset, rate, sawtooth and delay."""
+        return (*super().names, self.delay.name)
 
     def lag(self, time: Array, values: Mapping[str, Array], zero: float) -> Array:
         """Return stamps minus true times, (M,), s; arguments are those of `Clock.lag`."""
         return super().lag(time, values, zero) + float(values[self.delay.name][0])
+
+    def by_parameters(
+        self, time: Array, values: Mapping[str, Array], zero: float
+    ) -> dict[str, Array]:
+        """Return the derivatives of the lag, (M,) by name; arguments are those of `lag`."""
+        by_clock = super().by_parameters(time, values, zero)
+        return by_clock | {self.delay.name: np.ones(time.size)}
 
 
 def on_shared_clocks(parameters: Iterable[Parameter], aids: Sequence[Aid]) -> list[Parameter]:

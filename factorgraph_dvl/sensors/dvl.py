@@ -31,6 +31,14 @@ from factorgraph_dvl.sensors.dvl_distortion import (
     Distortion,
     is_distorted,
 )
+from factorgraph_dvl.sensors.dvl_water import (
+    CURRENT,
+    CURRENT_SPEC,
+    WATER,
+    WATER_SPAN,
+    WATER_SPAN_SPEC,
+    WATER_SPEC,
+)
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     ExpectedCorrelation,
@@ -67,17 +75,12 @@ LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
 CLOCK = Clock.of("dvl")
 AVERAGING_SPEC = averaging_spec()
-# Plausible size, m/s. Chosen: tides and ocean currents.
-CURRENT_SPEC = ParameterSpec(
-    "current", "m_s", labels=("e", "n"), frame="n", plausible=0.5, of_record=True
-)
 
 MISALIGNMENT = MISALIGNMENT_SPEC.name
 SCALE_ERROR = SCALE_SPEC.name
 LEVER_ARM = LEVER_ARM_SPEC.name
 BIAS = BIAS_SPEC.name
 TIME_OFFSET = CLOCK.offset.name
-CURRENT = CURRENT_SPEC.name
 AVERAGING = AVERAGING_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.
@@ -184,7 +187,8 @@ class Dvl:
     optional: ClassVar[tuple[tuple[str, ...], ...]] = (STD_COLUMNS,)
     specs: ClassVar[tuple[ParameterSpec, ...]] = (
         *(MISALIGNMENT_SPEC, SCALE_SPEC, SCALES_SPEC, LEVER_ARM_SPEC),
-        *(BIAS_SPEC, *CLOCK.specs, AVERAGING_SPEC, CURRENT_SPEC),
+        *(BIAS_SPEC, *CLOCK.specs, AVERAGING_SPEC),
+        *(CURRENT_SPEC, WATER_SPEC, WATER_SPAN_SPEC),
         *SPECS,
     )
 
@@ -287,6 +291,7 @@ class Dvl:
             *CLOCK.parameters(s),
             usual_parameter(AVERAGING_SPEC, s.averaging_s, s.averaging_std_s),
             Parameter(CURRENT_SPEC, np.zeros(2), current),
+            *(Parameter(spec, np.zeros(2), np.zeros(2)) for spec in (WATER_SPEC, WATER_SPAN_SPEC)),
             *(
                 Parameter(spec, np.zeros(spec.size), stated.get(spec.name, np.zeros(spec.size)))
                 for spec in SPECS
@@ -387,6 +392,7 @@ class DvlVelocity(ObservationByRows):
         LEVER_ARM,
         BIAS,
         CURRENT,
+        WATER,
         *NAMES,
     )
     middle: float = 0.0
@@ -408,7 +414,7 @@ class DvlVelocity(ObservationByRows):
 
     def residual(self, motion: Motion, values: Values) -> Array:
         """Return predicted - measured in d, (M, 3), m/s."""
-        dvl_b, _ = _velocity_at_dvl(motion, values)
+        dvl_b, _ = _velocity_at_dvl(motion, values, self.time)
         scale, axes = values[SCALE_ERROR], values[MISALIGNMENT]
         if is_distorted(values):
             found = self._distortion(motion, values, dvl_b)
@@ -424,7 +430,7 @@ class DvlVelocity(ObservationByRows):
 
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
-        dvl_b, imu_b = _velocity_at_dvl(motion, values)
+        dvl_b, imu_b = _velocity_at_dvl(motion, values, self.time)
         bRn = motion.nRb.transpose(0, 2, 1)
         scale, axes, flexed_b = 1.0 + values[SCALE_ERROR], values[MISALIGNMENT], dvl_b
         distorted, found = is_distorted(values), self._distortion(motion, values, dvl_b)
@@ -453,6 +459,7 @@ class DvlVelocity(ObservationByRows):
             LEVER_ARM: lambda: by_velocity @ skew(motion.omega_eb_b),
             BIAS: lambda: np.broadcast_to(np.eye(3), d_v.shape),
             CURRENT: lambda: -d_v[:, :, :2],
+            WATER: lambda: -d_v[:, :, :2] * _in_water(self.time, values)[:, None, None],
         }
         d_theta, d_omega = by_velocity @ skew(imu_b), -by_velocity @ skew(values[LEVER_ARM])
         if more is not None:
@@ -479,10 +486,19 @@ def _from_joint(p: Parameter, joint: JointPrior) -> Parameter:
     return Parameter(spec, value * p.si, joint.std(p.name) * p.si, joint)
 
 
-def _velocity_at_dvl(motion: Motion, values: Values) -> tuple[Array, Array]:
+def _in_water(time: Array, values: Values) -> Array:
+    """Whether pings are within the span in which water is seen, (M,)."""
+    first, last = values.get(WATER_SPAN, np.zeros(2))
+    return (time >= first) & (time <= last)
+
+
+def _velocity_at_dvl(motion: Motion, values: Values, time: Array) -> tuple[Array, Array]:
     """Return the velocities of DVL and IMU, relative to bottom or water, in body, (M, 3)."""
     # One for all, or one for each.
     current_n = np.zeros((*values[CURRENT].shape[:-1], 3))
     current_n[..., :2] = values[CURRENT]
+    if WATER in values and values[WATER].any():
+        water_n = _in_water(time, values)[:, None] * np.array([*values[WATER], 0.0])
+        current_n = current_n + water_n
     imu_b = rotate(motion.nRb.transpose(0, 2, 1), motion.v_n - current_n)
     return imu_b + cross(motion.omega_eb_b, values[LEVER_ARM]), imu_b

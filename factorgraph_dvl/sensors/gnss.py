@@ -61,7 +61,7 @@ _CLOCK = Clock.of("gnss", prefix="gnss_")
 # one second, with their stamps at the end.
 _DELAY = usual_spec("gnss_velocity_delay", 0.5)
 _AVERAGING = averaging_spec("gnss_velocity_", 1.0)
-_VELOCITY_CLOCK = LateClock(_CLOCK.offset, _CLOCK.rate, _DELAY)
+_VELOCITY_CLOCK = LateClock(_CLOCK.offset, _CLOCK.rate, _CLOCK.sawtooth, _CLOCK.period, _DELAY)
 TIME_OFFSET = _CLOCK.offset.name
 
 

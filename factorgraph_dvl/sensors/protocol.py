@@ -170,10 +170,13 @@ class SensorClock(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters offset and rate, and of a delay if there is one."""
+        """Names of the parameters offset, rate and others."""
 
     def lag(self, time: Array, values: Values, zero: float) -> Array:
         """Return stamps minus true times, (M,), s."""
+
+    def by_parameters(self, time: Array, values: Values, zero: float) -> dict[str, Array]:
+        """Return the derivatives of the lag by each parameter, (M,) by name."""
 
 
 @dataclass(frozen=True)

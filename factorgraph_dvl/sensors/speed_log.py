@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.rotations import BodyAxes, frd_from_body
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, rotate, skew
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.sensors.dvl import CURRENT_SPEC
+from factorgraph_dvl.sensors.dvl_water import CURRENT_SPEC
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
     Linearization,

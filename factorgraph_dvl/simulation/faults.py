@@ -281,17 +281,23 @@ def dvl_slipped(turn_deg: Sequence[float], share: float = 0.5) -> Fault:
     return fault
 
 
-def dvl_water_track(current_m_s: Sequence[float], duration_s: float = 60.0) -> Fault:
+def dvl_water_track(
+    current_m_s: Sequence[float], duration_s: float = 60.0, share: float = 0.0
+) -> Fault:
     """Measure against a layer of water, which a current, east, north, up, moves.
 
-    For a while; with an infinite duration, all the time.
+    For a while; with an infinite duration, all the time. Or for a share of the record, from a
+    third of it on.
     """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl, reference = record_of(trial, "dvl"), trial.reference
         assert reference is not None
         inside = np.ones(dvl.time.size, dtype=bool)
-        if np.isfinite(duration_s):
+        if share > 0.0:
+            since = (dvl.time - dvl.time[0]) / np.ptp(dvl.time) - 1.0 / 3.0
+            inside = (since >= 0.0) & (since < share)
+        elif np.isfinite(duration_s):
             (inside,) = _spans(dvl.time, duration_s, 1, rng)
         rph = [np.interp(dvl.time, reference.time, angle) for angle in np.unwrap(reference.rph.T)]
         roll, pitch, heading = rph

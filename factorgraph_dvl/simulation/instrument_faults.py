@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
 from factorgraph_dvl.simulation.faults import Fault, record_of, with_arrays
 from factorgraph_dvl.trial import Reference, Trial
 
@@ -69,6 +71,48 @@ def dvl_averages(length_s: float) -> Fault:
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(dvl.velocity, axis=0)])
         velocity = (sums[last] - sums[first]) / (last - first)[:, None]
         return with_arrays(trial, "dvl", velocity=velocity)
+
+    return fault
+
+
+def saw_of_delays(section: str, longest_s: float, period_s: float = 10.0) -> Fault:
+    """Stamp a record later and later up to a delay, and in time again, as a filling buffer does.
+
+    The delay is zero on average, and stamps stay in order.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        time = record_of(trial, section).time
+        phase = np.mod(time / period_s + rng.uniform(), 1.0)
+        moved = np.sort(time + longest_s * (phase - 0.5))
+        return with_arrays(trial, section, time=moved + 1e-9 * np.arange(time.size))
+
+    return fault
+
+
+def compass_deviates(deviation_deg: Sequence[float], std_deg: float = 0.2) -> Fault:
+    """Add a compass, once a second, whose heading is off by what depends on the heading.
+
+    Parameters
+    ----------
+    deviation_deg : sequence of float, shape (4,)
+        Amplitudes of sine and cosine of the heading, and of twice the heading.
+    std_deg : float, default 0.2
+        Standard deviation of the white noise of each heading.
+    """
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        reference = _reference(trial)
+        time = np.arange(reference.time[0], reference.time[-1], 1.0)
+        heading = np.interp(time, reference.time, np.unwrap(reference.rph[:, 2]))
+        h = heading[:, None] * [1.0, 1.0, 2.0, 2.0]
+        waves = np.where([True, False, True, False], np.sin(h), np.cos(h))
+        noise = std_deg * rng.standard_normal(time.size)
+        measured = heading + np.radians(waves @ np.asarray(deviation_deg, float) + noise)
+        # Tilt is not measured.
+        rph = np.column_stack([np.full((time.size, 2), np.nan), measured % (2.0 * np.pi)])
+        settings = AttitudeSettings(std_deg=(2.0, 2.0, std_deg), correlated_share=0.0)
+        return replace(trial, others=(*trial.others, Attitude(settings, time, rph)))
 
     return fault
 

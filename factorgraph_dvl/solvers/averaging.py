@@ -22,9 +22,11 @@ from factorgraph_dvl.solvers.record_scores import (
     by_square,
     record_scores,
     record_sums_in_turn,
+    squares_of,
+    unexplained,
     window_part,
 )
-from factorgraph_dvl.statistics.scores import Score, Scores
+from factorgraph_dvl.statistics.scores import Score, Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Share of the sensors that neither average nor are late for which a time is tried all the same.
@@ -32,7 +34,7 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 _BY_CHANCE = 0.05
 # Share of a misfit that a window must explain. Chosen: more than any other cause can.
 _SHARE = 0.5
-# Standard deviations from which on a length, or a misfit, is one. Chosen: seldom by chance.
+# Standard deviations from which on a length is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
 
 
@@ -69,7 +71,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
         if not known[cause].spec.usual or tests.score[tests.places[cause]][0] <= 0.0:
             continue
         scatter = float(np.vdot(residual, residual)) / np.count_nonzero(bound.weight)
-        explains = share * found[cause] >= _SHARE * _misfit(bound, residual)
+        explains = share * found[cause] >= _SHARE * unexplained(bound, residual)
         # One-sided: lengths are above zero.
         shown = float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
         if not (found[cause] > shown * scatter and explains):
@@ -86,9 +88,11 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
 def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: str) -> Score:
     """Return the test of one time by all measurements of a record."""
     evaluation, information = minimum.evaluation, _information(problem, minimum)
-    sums = record_sums_in_turn(problem, bound, evaluation, name, squared=name == _length(bound))
+    unknown = {name: np.full(1, np.inf)}
+    squares = squares_of(problem, evaluation, name) if name == _length(bound) else None
+    sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
     known = sums.square - information.covariance_of([sums.by_key])
-    return Scores({name: slice(0, 1)}, sums.score, known, np.full(1, np.inf)).test([name])
+    return Scores(places_of(unknown), sums.score, known, unknown[name]).test([name])
 
 
 def _of_length(test: Score) -> Score:
@@ -96,21 +100,6 @@ def _of_length(test: Score) -> Score:
     length = np.sqrt(np.maximum(test.step, 0.0))
     std = test.std / (2.0 * np.maximum(length, np.finfo(float).tiny))
     return replace(test, step=length, std=std)
-
-
-def _misfit(bound: BoundObservation, residual: Array) -> float:
-    """Return the squares of residuals beyond what they differ by from one to the next.
-
-    Zero where it may be chance.
-    """
-    used = bound.weight.all(axis=1)
-    own = residual[used]
-    if len(own) < 2:
-        return 0.0
-    noise = 0.5 * np.mean(np.diff(own, axis=0) ** 2, axis=0)
-    beyond = float(np.sum(own**2 - noise))
-    chance = float(np.sqrt(2.0 * np.sum(noise**2) * len(own)))
-    return beyond if beyond > _CERTAIN * chance else 0.0
 
 
 def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Finding, ...]:

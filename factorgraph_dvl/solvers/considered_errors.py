@@ -20,7 +20,7 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
-from factorgraph_dvl.solvers.record_scores import record_sums_in_turn
+from factorgraph_dvl.solvers.record_scores import record_sums_in_turn, squares_of
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -88,7 +88,9 @@ def _by_windows(
             continue
         if p.mean.any() or not bound.weight.any():
             continue
-        sums = record_sums_in_turn(problem, bound, evaluation, p.name, squared=True)
+        unknown = {p.name: np.full(1, np.inf)}
+        squares = squares_of(problem, evaluation, p.name)
+        sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
         moved = information.covariance_with([sums.by_key])
         taken_up = moved.after(sums.by_key)
         known = max(float((sums.square - taken_up)[0, 0]), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -25,6 +25,8 @@ from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_change
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
 from factorgraph_dvl.solvers.record_scores import record_scores
+from factorgraph_dvl.solvers.sawtooth import sawtooths
+from factorgraph_dvl.solvers.water_span import water_spans
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_by_source
 from factorgraph_dvl.statistics.scores import Score
@@ -70,16 +72,20 @@ class Explanation:
     others : tuple of str or Message
         Names of those that explain the misfit about as well, `imu.sampling` where that does, and
         changes along the trial that do.
+    shape : Parameter, optional
+        What a search found of it: the period of a sawtooth, or the span of water.
     """
 
     parameter: Parameter
     score: Score
     others: tuple[str | Message, ...]
+    shape: Parameter | None = None
 
     @property
-    def freed(self) -> Parameter:
-        """The parameter, to be estimated."""
-        return wide(self.parameter, self.parameter.mean)
+    def freed(self) -> tuple[Parameter, ...]:
+        """The parameter, to be estimated, and its shape."""
+        freed = wide(self.parameter, self.parameter.mean)
+        return (freed,) if self.shape is None else (freed, self.shape)
 
 
 def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanation | None:
@@ -99,8 +105,10 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     time = problem.chain.node_time
     if time[-1] - time[0] < _SHORTEST:
         return None
-    weighed = _weighed(problem, minimum)
-    tests = _tests(problem, minimum, weighed)
+    weighed, information = _weighed(problem, minimum), minimum.information
+    shapes = sawtooths(problem, minimum.evaluation)
+    shapes |= water_spans(problem, minimum.evaluation, information)
+    tests = _tests(problem, minimum, weighed, shapes)
     asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
     shared = np.log10(max(asked, 1))
     significant = [
@@ -131,7 +139,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
-    return Explanation(parameter, test, others)
+    shape, _ = shapes.get(parameter.name, (None, 0))
+    return Explanation(parameter, test, others, shape)
 
 
 def _limit(p: Parameter) -> float:
@@ -201,9 +210,15 @@ def _weighed(problem: Problem, minimum: Minimum) -> _Weighed:
 
 
 def _tests(
-    problem: Problem, minimum: Minimum, weighed: _Weighed
+    problem: Problem,
+    minimum: Minimum,
+    weighed: _Weighed,
+    shapes: Mapping[str, tuple[Parameter, int]],
 ) -> dict[str, tuple[Parameter, Score]]:
-    """Return tests of what is taken as known, within a prior or for certain, by name."""
+    """Return tests of what is taken as known, within a prior or for certain, by name.
+
+    Sawtooths and spans of water are those that a search found, among as many as there were.
+    """
     evaluation, information = minimum.evaluation, minimum.information
     used = {
         name
@@ -217,26 +232,35 @@ def _tests(
         if not (p.estimated or p.spec.plausible is None or p.spec.usual or p.spec.of_record)
         and p.name in used
     ]
-    known += _shown_by_records(problem, evaluation, information)
+    known += _shown_by_records(problem, evaluation, information, shapes)
     out = _tests_of_priors(problem, evaluation, information)
     of_priors = [p for p, _ in out.values()]
     if not known and not of_priors:
         return {}
     at, ratios = weighed.evaluation, weighed.ratios
-    free = freed(weighed.problem, at, weighed.information, known, weighed.step)
-    out |= {p.name: (p, free.scores.test([p.name])) for p in known}
+    found_shapes = [shape for shape, _ in shapes.values()]
+    free = freed(weighed.problem, at, weighed.information, known, weighed.step, found_shapes)
+    out |= {p.name: (p, _searched(free.scores.test([p.name]), p, shapes)) for p in known}
     # Scores scatter by no less than this.
     least = min([1.0, *(float(np.min(ratio)) ** 2 for ratio in ratios.values())])
     if all(test.divided(least).log10_p >= _limit(p) for p, test in out.values()):
         return out
     others = {p.name: (problem.key(p.name), wide(p, p.mean).sigma) for p in of_priors}
     found, scatter = free.scattered(problem.chain.node_time, ratios, others)
-    out |= {p.name: (p, found.test([p.name])) for p in known}
+    out |= {p.name: (p, _searched(found.test([p.name]), p, shapes)) for p in known}
     return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
 
 
+def _searched(test: Score, p: Parameter, shapes: Mapping[str, tuple[Parameter, int]]) -> Score:
+    """Return a test as that of the best of all shapes, if its parameter has one."""
+    return test.searched(shapes[p.name][1]) if p.name in shapes else test
+
+
 def _shown_by_records(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    shapes: Mapping[str, tuple[Parameter, int]],
 ) -> list[Parameter]:
     """Return the parameters of one record each that its rows ask for.
 
@@ -247,6 +271,8 @@ def _shown_by_records(
     if problem.chain.interpolates:
         return out
     ratios = _ratios(problem, evaluation)
+    own_shapes = {shape.name: shape.mean for shape, _ in shapes.values()}
+    there = replace(evaluation, parameters={**evaluation.parameters, **own_shapes})
     known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
     for bound, at, motion in zip(
         problem.bound, evaluation.attached, evaluation.motions, strict=True
@@ -257,10 +283,10 @@ def _shown_by_records(
             continue
         here = replace(bound, attachment=at)
         priors = {p.name: wide(p, p.mean).sigma for p in own}
-        found = record_scores(problem, here, evaluation, information, priors, motion)
+        found = record_scores(problem, here, there, information, priors, motion)
         variance = float(np.mean(np.square(ratios.get(label, 1.0))))
         for p in own:
-            test = found.test([p.name]).divided(variance)
+            test = _searched(found.test([p.name]).divided(variance), p, shapes)
             if test.log10_p < _limit(p):
                 out.append(p)
     return out
@@ -291,7 +317,7 @@ def explanation_findings(
                 std=_uncertainty(e.parameter),
                 chi2=_chi_square(e),
                 value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
-                others=_leap_seconds(e.parameter, evaluation) or _or(e),
+                others=_leap_seconds(e.parameter, evaluation) or _shape(e) or _or(e),
             ),
             parameter=e.parameter.name,
         )
@@ -322,6 +348,15 @@ def _leap_seconds(p: Parameter, evaluation: Evaluation) -> Message | None:
         return None
     off = abs(float(evaluation.parameters[p.name][0]))
     return message("leap_seconds.estimated") if abs(off - LEAP_SECONDS) < 1.0 else None
+
+
+def _shape(found: Explanation) -> Message | None:
+    """Return what a parameter is that has a shape, None if it has none."""
+    if found.shape is None:
+        return None
+    values = dict(zip(found.shape.spec.labels, found.shape.mean, strict=True))
+    key = "sawtooth.estimated" if "period" in values else "water_span.estimated"
+    return message(key, **values)
 
 
 def _uncertainty(p: Parameter) -> Message:
@@ -356,6 +391,7 @@ def freed(
     information: SquareRootInformation,
     known: Sequence[Parameter],
     step: gtsam.VectorValues | None = None,
+    shapes: Sequence[Parameter] = (),
 ) -> ParameterScores:
     """Return the scores of parameters that a problem takes as known, as it is weighed.
 
@@ -367,9 +403,14 @@ def freed(
         The parameters.
     step : gtsam.VectorValues, optional
         Step to the minimum, if it is not there.
+    shapes : sequence of Parameter, optional
+        Shapes of some of them, as a search found them.
     """
     names = {p.name for p in known}
-    fixed = [p for p in problem.all_parameters if not p.estimated]
+    found = {shape.name: shape for shape in shapes}
+    fixed = [found.get(p.name, p) for p in problem.all_parameters if not p.estimated]
+    values = evaluation.parameters | {name: shape.mean for name, shape in found.items()}
+    evaluation = replace(evaluation, parameters=values)
     # Those that are estimated come first, and keep their keys.
     every = [*problem.parameters, *(wide(p, p.mean) if p.name in names else p for p in fixed)]
     columns = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -24,6 +24,11 @@ _CHUNK = 4096
 _ENOUGH, _STRETCHES = 10_000, 20
 # Time between the slopes that show a curvature, s. Chosen: no window is shorter.
 _BETWEEN = 0.1
+# Standard deviations from which on a misfit is one. Chosen: seldom by chance.
+_CERTAIN = 3.0
+
+# Returns derivatives (M, d, n) of some rows of a record, by name of the parameter.
+Derivatives = Callable[[BoundObservation, Motion], Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -124,35 +129,59 @@ def record_sums(
 
 
 def record_sums_in_turn(
-    problem: Problem, bound: BoundObservation, evaluation: Evaluation, name: str, *, squared: bool
+    problem: Problem,
+    bound: BoundObservation,
+    evaluation: Evaluation,
+    candidates: Mapping[str, Array],
+    derivatives: Derivatives | None = None,
 ) -> RecordSums:
-    """Return what the rows of a long record say of one number, some of them after the other.
+    """Return `record_sums` of a long record, some of its rows after the other.
 
     Parameters
     ----------
     problem : Problem
-        Problem without the parameter.
+        Problem without these parameters.
     bound : BoundObservation
         The observation.
     evaluation : Evaluation
         The minimum.
-    name : str
-        Name of the parameter.
-    squared : bool
-        Whether it is the length of a window, and the number its square.
+    candidates : mapping of str to ndarray
+        Standard deviations (n,) of the wide prior of each, SI; they may be infinite.
+    derivatives : callable, optional
+        Returns derivatives of some rows by the parameters, in place of those of the observation.
     """
-    wide = {name: np.full(1, np.inf)}
-    score, square, by_key = np.zeros(1), np.zeros((1, 1)), dict[int, Array]()
+    size = sum(sigma.size for sigma in candidates.values())
+    score, square, by_key = np.zeros(size), np.zeros((size, size)), dict[int, Array]()
     count = bound.observation.time.size
     for begin in range(0, count, _CHUNK):
         some = np.arange(begin, min(begin + _CHUNK, count))
         part, motion = part_of(problem, bound, some, evaluation)
-        squares = {name: by_square(problem, part, evaluation)} if squared else {}
-        sums = record_sums(problem, part, evaluation, wide, motion, squares)
+        own = {} if derivatives is None else derivatives(part, motion)
+        sums = record_sums(problem, part, evaluation, candidates, motion, own)
         score, square = score + sums.score, square + sums.square
         for key, rows in sums.by_key.items():
             by_key[key] = by_key[key] + rows if key in by_key else rows
     return RecordSums(score, square, by_key)
+
+
+def squares_of(problem: Problem, evaluation: Evaluation, name: str) -> Derivatives:
+    """Return what gives `by_square` of rows as the derivatives by the length of a window."""
+    return lambda part, _: {name: by_square(problem, part, evaluation)}
+
+
+def unexplained(bound: BoundObservation, residual: Array) -> float:
+    """Return the squares of residuals beyond what they differ by from one to the next.
+
+    Zero where it may be chance.
+    """
+    used = bound.weight.all(axis=1)
+    own = residual[used]
+    if len(own) < 2:
+        return 0.0
+    noise = 0.5 * np.mean(np.diff(own, axis=0) ** 2, axis=0)
+    beyond = float(np.sum(own**2 - noise))
+    chance = float(np.sqrt(2.0 * np.sum(noise**2) * len(own)))
+    return beyond if beyond > _CERTAIN * chance else 0.0
 
 
 def window_part(

@@ -406,14 +406,18 @@ def _explained(at: Estimated) -> Explanation | None:
     return explanation(at.problem, at.minimum, at.model.prepared.trial.imu)
 
 
-def _different(*causes: Explanation | None) -> list[Explanation]:
-    """Return the causes that there are, each parameter once."""
-    return list({c.parameter.name: c for c in causes if c is not None}.values())
+def _different(now: Explanation | None, at_first: Explanation | None) -> list[Explanation]:
+    """Return the causes that there are, each parameter once.
+
+    Its shape is that of the first minimum: nothing of it was left out there as a gross error.
+    """
+    found = [cause for cause in (now, at_first) if cause is not None]
+    return list({cause.parameter.name: cause for cause in found}.values())
 
 
 def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     """Yield what estimates a parameter instead, with noise as stated and as found."""
-    freed = _with_others(at, cause.freed)
+    freed = _with_others(at, *cause.freed)
     # What the misfit made of noise and gross errors is to be found anew.
     for model in (freed.as_stated(), freed):
         yield Proposal(model, at.states, at.values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -43,6 +43,10 @@ class Score:
         """Logarithm of the probability of a larger chi2 by chance; -inf where it underflows."""
         with np.errstate(divide="ignore"):
             return float(np.log10(chdtrc(self.freedom, self.chi2)))
+
+    def searched(self, count: int) -> Score:
+        """Return the test of the best of so many shapes of a candidate: each may be by chance."""
+        return replace(self, chi2=max(self.chi2 - 2.0 * float(np.log(count)), 0.0))
 
     def divided(self, scatter: float) -> Score:
         """Return the test where scores scatter more, in variance, than white noise makes them."""

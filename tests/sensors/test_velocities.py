@@ -11,6 +11,7 @@ from offsets import OFFSET_RAD
 from truth import exact_motion, scenario
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.records import rows_of
 from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.graph.clocks import linearized, true_time
@@ -33,7 +34,11 @@ def dvl_values(**changes):
         "dvl_bias_m_s": np.array([0.01, -0.02, 0.03]),
         "time_offset_s": np.array([0.08]),
         "dvl_clock_rate_ppm": np.zeros(1),
+        "dvl_sawtooth_delay_s": np.zeros(1),
+        "dvl_sawtooth_s": np.array([0.7, 0.1]),
         "current_m_s": np.zeros(2),
+        "water_current_m_s": np.zeros(2),
+        "water_span_s": np.array([0.5, 3.5]),
         "gnss_time_offset_s": np.zeros(1),
         "gnss_clock_rate_ppm": np.zeros(1),
         "gnss_velocity_delay_s": np.zeros(1),
@@ -122,6 +127,8 @@ def test_dvl_velocity_jacobians(scale, misalignment):
         scale_error=np.array(scale),
         misalignment_deg=exp_so3(np.array(misalignment) * DEG),
         current_m_s=np.array([0.4, -0.6]),
+        water_current_m_s=np.array([-0.2, 0.1]),
+        dvl_sawtooth_delay_s=np.array([0.05]),
     )
     # Truncation by nothing bends at rest: a difference there errs by the square of its step.
     check_jacobians(o, random_motion(), values, dvl.parameters(), tolerance=1e-7)
@@ -130,7 +137,7 @@ def test_dvl_velocity_jacobians(scale, misalignment):
     }
     # Less bends too much for a numerical derivative.
     distorted["dvl_truncation_m_s"] = np.array([0.3])
-    check_jacobians(o, random_motion(), distorted, dvl.parameters())
+    check_jacobians(o, random_motion(), distorted, dvl.parameters(), tolerance=3e-8)
 
 
 DISTORTED = {
@@ -169,6 +176,24 @@ def test_a_distortion_by_hand(name):
     o = DvlVelocity(np.array([3600.0]), measured, np.full((1, 3), 0.01))
     at = replace(hand_motion(), p_n=np.array([[1000.0, 0.0, -500.0]]))
     np.testing.assert_allclose(o.residual(at, values) + measured, [expected], atol=1e-12)
+
+
+def test_water_that_is_seen_for_a_while_by_hand():
+    """0.3 m/s along with the vehicle, at 2 m/s east and level: 1.7 m/s, from 10 to 20 s."""
+    time = np.array([9.9, 10.0, 20.0, 20.1])
+    at = rows_of(hand_motion(), np.zeros(4, dtype=int))
+    values = dvl_values(
+        misalignment_deg=QUARTER,
+        scale_error=np.zeros(1),
+        lever_arm_m=np.zeros(3),
+        dvl_bias_m_s=np.zeros(3),
+        water_current_m_s=np.array([0.3, 0.0]),
+        water_span_s=np.array([10.0, 20.0]),
+    )
+    measured = np.tile([-2.0, 0.0, 0.0], (4, 1))
+    o = DvlVelocity(time, measured, np.full((4, 3), 0.01))
+    expected = [[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    np.testing.assert_allclose(o.residual(at, values), expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("turned", ["roll", "pitch"])

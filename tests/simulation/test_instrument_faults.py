@@ -74,6 +74,26 @@ def test_digits_windows_and_scales(trial):
     np.testing.assert_allclose(grown, moving.dvl.velocity * expected[:, None])
 
 
+def test_stamps_rise_and_fall_back(trial):
+    made = with_faults(trial, [g.saw_of_delays("dvl", 0.05)])
+    late = made.dvl.time - trial.dvl.time
+    assert np.all(np.diff(made.dvl.time) > 0.0)
+    assert np.abs(late).max() <= 0.025 + 1e-6
+    # 5 ms for each second but where it falls back, once in ten.
+    slope = np.diff(late) / np.diff(trial.dvl.time)
+    assert np.median(slope) == pytest.approx(0.005, rel=1e-6)
+    assert np.count_nonzero(slope < 0.0) in (5, 6)
+
+
+def test_a_compass_deviates_by_its_heading(trial):
+    reference = replace(trial.reference, rph=trial.reference.rph + 0.5 * np.pi * np.eye(3)[2])
+    turned = replace(trial, reference=reference)
+    (compass,) = with_faults(turned, [g.compass_deviates((3.0, 1.0, 1.0, 2.0), 0.0)]).others
+    # At 90 deg: 3 - 2.
+    np.testing.assert_allclose(compass.rph[:, 2], np.radians(91.0), atol=1e-12)
+    assert np.isnan(compass.rph[:, :2]).all()
+
+
 def test_a_current_is_there_all_the_time(trial):
     still = replace(
         trial,

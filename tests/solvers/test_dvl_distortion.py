@@ -39,6 +39,8 @@ FAULTS = {
     "dvl_truncation_m_s": instrument_faults.truncated("dvl", 0.01),
     "current_m_s": faults.dvl_water_track((0.1, 0.0, 0.0), np.inf),
     "gyro_delay_s": instrument_faults.gyros_late(0.01),
+    "dvl_sawtooth_delay_s": instrument_faults.saw_of_delays("dvl", 0.01),
+    "compass_deviation_deg": instrument_faults.compass_deviates((1.0, 0.5, 0.3, 0.2)),
 }
 EXPECTED = {
     "dvl_scale_by_speed_s_m": 0.002,
@@ -47,6 +49,9 @@ EXPECTED = {
     "dvl_truncation_m_s": 0.005,
     "current_m_s": (0.1, 0.0),
     "gyro_delay_s": 0.01,
+    # By a clock that is late itself.
+    "dvl_sawtooth_delay_s": 0.01 / 1.001,
+    "compass_deviation_deg": (1.0, 0.5, 0.3, 0.2),
 }
 
 

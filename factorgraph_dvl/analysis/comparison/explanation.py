@@ -17,12 +17,12 @@ from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.dvl import (
     BIAS,
-    CURRENT,
     LEVER_ARM,
     MISALIGNMENT,
     SCALE_ERROR,
     TIME_OFFSET,
 )
+from factorgraph_dvl.sensors.dvl_water import CURRENT
 from factorgraph_dvl.solution import Solution
 
 # Parameters of the DVL's measurement equation: if a result omits one, its effect biases the

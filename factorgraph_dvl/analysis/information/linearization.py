@@ -27,7 +27,6 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.dvl import (
     BIAS,
-    CURRENT,
     LEVER_ARM,
     MISALIGNMENT,
     SCALE_ERROR,
@@ -36,6 +35,7 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.dvl_beams import DIRECTION as BEAM_DIRECTION
 from factorgraph_dvl.sensors.dvl_beams import SCALE_ERROR as BEAM_SCALE_ERROR
+from factorgraph_dvl.sensors.dvl_water import CURRENT
 from factorgraph_dvl.solution import Solution
 from factorgraph_dvl.trial import Trial
 
