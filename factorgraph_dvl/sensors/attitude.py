@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar, Self
 
 import msgspec
@@ -53,14 +53,11 @@ _APART = 2.0
 
 HEADING_OFFSET_SPEC = ParameterSpec("heading_offset", "deg", labels=SCALAR, kind="angle")
 SCHULER_SPEC = ParameterSpec("heading_schuler", "deg", labels=("cos", "sin"), nuisance=True)
-# Plausible deviation, deg. Chosen: that of a compass near steel that nobody compensated.
 DEVIATION_SPEC = ParameterSpec(
-    "compass_deviation",
-    "deg",
-    labels=("sin_1", "cos_1", "sin_2", "cos_2"),
-    nuisance=True,
-    plausible=3.0,
+    "compass_deviation", "deg", labels=("sin_1", "cos_1", "sin_2", "cos_2"), nuisance=True
 )
+# Plausible deviation, deg. Chosen: that of a compass near steel that nobody compensated.
+_DEVIATION_DEG = 3.0
 _CLOCK = Clock.of("attitude", prefix="attitude_")
 
 HEADING_OFFSET = HEADING_OFFSET_SPEC.name
@@ -186,17 +183,30 @@ class Attitude:
     def parameters(self) -> tuple[Parameter, ...]:
         """Return heading offset, Schuler oscillation, compass deviation and the clock."""
         s = self.settings
+        deviation = DEVIATION_SPEC
+        if self._turns:
+            deviation = replace(deviation, plausible=_DEVIATION_DEG)
         return (
             *(
                 Parameter(spec, np.zeros(spec.size), np.full(spec.size, std * DEG))
                 for spec, std in (
                     (HEADING_OFFSET_SPEC, s.heading_offset_std_deg),
                     (SCHULER_SPEC, s.schuler_std_deg),
-                    (DEVIATION_SPEC, s.deviation_std_deg),
+                    (deviation, s.deviation_std_deg),
                 )
             ),
             *_CLOCK.parameters(s),
         )
+
+    @property
+    def _turns(self) -> bool:
+        """Whether there are headings enough to show a deviation: its four numbers, and an offset.
+
+        On a straight run anything that follows the heading, as a lag, looks like one.
+        """
+        heading = self.rph[:, 2]
+        octants = np.floor(heading[np.isfinite(heading)] / (0.25 * np.pi)) % 8.0
+        return np.unique(octants).size > DEVIATION_SPEC.size
 
     def observations(self, frame: LocalFrame, body_axes: BodyAxes) -> tuple[Observation, ...]:
         """Return attitudes that are far enough apart to have errors of their own."""

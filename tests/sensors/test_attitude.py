@@ -51,6 +51,14 @@ def test_attitude_is_that_of_the_body_and_the_error_of_the_heading(motion):
     np.testing.assert_allclose(angles.residual(motion, VALUES), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("headings", "asked"), [(range(0, 360, 30), True), ((85, 95), False)])
+def test_a_deviation_is_asked_for_where_there_are_headings_enough(headings, asked):
+    rph = np.array([[0.0, 0.0, h % 360] for h in headings]) * DEG
+    record = Attitude(AttitudeSettings(), np.arange(float(len(rph))), rph)
+    (deviation,) = (p for p in record.parameters() if p.name == "compass_deviation_deg")
+    assert (deviation.spec.plausible is not None) == asked
+
+
 def test_derivatives_are_those_of_the_residual(motion):
     sensor = compass()
     (angles,) = sensor.observations(FRAME, "FRD")
