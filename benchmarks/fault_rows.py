@@ -94,7 +94,7 @@ ROWS = (
         "m/s",
         (0.05, 0.3, 1.0),
         lambda x: [f.dvl_false_lock(x)],
-        (gross("DVL"), r"^changed_along_trial[^:]*(dvl|scale|misalignment)"),
+        (gross("DVL"), r"water_current", r"^changed_along_trial[^:]*(dvl|scale|misalignment)"),
     ),
     Row(
         "DVL: layer of water for 60 s",

@@ -80,6 +80,7 @@ class Clock:
             nuisance=True,
             plausible=_SAWTOOTH_S,
             of_record=True,
+            searched=True,
         )
         period = ParameterSpec(
             f"{sensor}_sawtooth", "s", labels=("period", "start"), nuisance=True

@@ -12,7 +12,7 @@ CURRENT_SPEC = ParameterSpec(
 )
 # Of water that is seen in place of the bottom for a while: its current, and the first and the last
 # stamp, which a search finds.
-WATER_SPEC = replace(CURRENT_SPEC, stem="water_current", nuisance=True)
+WATER_SPEC = replace(CURRENT_SPEC, stem="water_current", nuisance=True, searched=True)
 WATER_SPAN_SPEC = ParameterSpec("water_span", "s", labels=("first", "last"), nuisance=True)
 
 CURRENT = CURRENT_SPEC.name

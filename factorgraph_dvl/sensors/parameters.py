@@ -85,6 +85,8 @@ class ParameterSpec:
         Whether most sensors have it although trials do not state it: a length, above zero.
     of_record : bool, default False
         Whether it changes one record only, and no motion: the rows of that record test it.
+    searched : bool, default False
+        Whether a search finds when it counts, as where it is zero for most of a trial.
     """
 
     stem: str
@@ -99,6 +101,7 @@ class ParameterSpec:
     plausible: float | None = None
     usual: bool = False
     of_record: bool = False
+    searched: bool = False
 
     @cached_property
     def name(self) -> str:

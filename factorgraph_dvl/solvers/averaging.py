@@ -19,10 +19,11 @@ from factorgraph_dvl.solvers.known_parameters import evidence
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import (
-    by_square,
+    of_whole,
+    part_of,
     record_scores,
     record_sums_in_turn,
-    squares_of,
+    squares_at,
     unexplained,
     window_part,
 )
@@ -89,7 +90,9 @@ def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: s
     """Return the test of one time by all measurements of a record."""
     evaluation, information = minimum.evaluation, _information(problem, minimum)
     unknown = {name: np.full(1, np.inf)}
-    squares = squares_of(problem, evaluation, name) if name == _length(bound) else None
+    squares = None
+    if name == _length(bound):
+        squares = of_whole(name, squares_at(problem, bound, minimum))
     sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
     known = sums.square - information.covariance_of([sums.by_key])
     return Scores(places_of(unknown), sums.score, known, unknown[name]).test([name])
@@ -138,11 +141,13 @@ def _scores(
     its place: it has a slope at 0.
     """
     evaluation, information = minimum.evaluation, _information(problem, minimum)
-    part, motion, share = window_part(problem, bound, evaluation)
+    count = bound.observation.time.size
+    some = window_part(count)
+    part, motion = part_of(problem, bound, some, evaluation)
     length = _length(bound)
-    squares = {length: by_square(problem, part, evaluation)} if length in known else {}
+    squares = {length: squares_at(problem, bound, minimum)[some]} if length in known else {}
     scores = record_scores(problem, part, evaluation, information, known, motion, squares)
-    return scores, share
+    return scores, count / some.size
 
 
 def _information(problem: Problem, minimum: Minimum) -> SquareRootInformation:

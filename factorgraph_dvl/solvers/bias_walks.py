@@ -15,7 +15,7 @@ from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.solution import Progress
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
 from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, squares_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
@@ -96,7 +96,7 @@ def bias_walks(
         Called with stage, iteration and cost.
     """
     information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
-    if not _walks(prepared.trial.inertial.settings, problem, minimum.evaluation, information):
+    if not _walks(prepared.trial.inertial.settings, problem, minimum, information):
         return None
     start = minimum.evaluation
     largest = _walked(prepared, problem, start, _START, noise, report)
@@ -214,15 +214,18 @@ def _squares(
 
 
 def _walks(
-    imu: ImuSettings, problem: Problem, evaluation: Evaluation, information: SquareRootInformation
+    imu: ImuSettings, problem: Problem, minimum: Minimum, information: SquareRootInformation
 ) -> bool:
     """Whether a bias that is stated as constant changes, or the IMU does not fit its walks."""
-    changes = component_changes(problem, evaluation, information)
-    if any(c.parameter.name in BIASES and c.change.chi2 > CHANGED**2 for c in changes):
+    if any(
+        c.parameter.name in BIASES and c.change.chi2 > CHANGED**2
+        for c in changes_at(problem, minimum)
+    ):
         return True
     walking = [WALK.format(bias) for name, bias in _WALKS.items() if getattr(imu, name) > 0.0]
     sources = [*IMU_NOISE, *walking]
-    return bool(walking) and _is_not_noise(*_squares(problem, evaluation, information, sources))
+    squares = _squares(problem, minimum.evaluation, information, sources)
+    return bool(walking) and _is_not_noise(*squares)
 
 
 def _is_not_noise(squares: float, freedom: float) -> bool:

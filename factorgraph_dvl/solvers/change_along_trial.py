@@ -15,6 +15,7 @@ from factorgraph_dvl.sensors.imu import BIASES, ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.constancy import Change, changes
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -24,6 +25,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 CHANGED = 5.0
 # Cost up to which a change is as probable as the most probable one. Chosen: a likelihood of e^-4.
 _TIE = 4.0
+# Name of what a minimum keeps.
+_CHANGES = "changes along the trial"
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,9 @@ def component_changes(
     information: SquareRootInformation,
     every: Iterable[Rows] | None = None,
 ) -> list[ComponentChange]:
-    """Return the most probable change of each component, errors of the IMU left out.
+    """Return the most probable change of each component.
+
+    Errors of the IMU are left out, and what a search finds for part of a trial.
 
     Parameters
     ----------
@@ -93,12 +98,22 @@ def component_changes(
         {problem.key(n): tilt.gradient[own] for n, own in problem.columns.items()} if tilt else {},
     )
     allowed = np.concatenate([p.sigma / p.si for p, _ in rows])
-    kept = [p.name not in ERRORS for _, p in of_component]
+    kept = [not (p.name in ERRORS or p.spec.searched) for _, p in of_component]
     return [
         ComponentChange(name, p, replace(test.within(float(sigma)), shift=test.shift[kept]))
         for (name, p), test, sigma, is_kept in zip(of_component, tests, allowed, kept, strict=True)
         if is_kept
     ]
+
+
+def changes_at(
+    problem: Problem, minimum: Minimum, every: Iterable[Rows] | None = None
+) -> list[ComponentChange]:
+    """Return `component_changes` at a minimum, worked out once."""
+    if _CHANGES not in minimum.kept:
+        found = component_changes(problem, minimum.evaluation, minimum.information, every)
+        minimum.kept[_CHANGES] = found
+    return list(minimum.kept[_CHANGES])
 
 
 def change_findings(
@@ -127,9 +142,7 @@ def change_findings(
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     """
-    tests = component_changes(
-        found.problem, found.minimum.evaluation, found.covariances.information, every
-    )
+    tests = changes_at(found.problem, found.minimum, every)
     std = {n: s for e in estimates for n, s in zip(e.component_names, e.std, strict=True)}
     significant = [
         t

@@ -20,9 +20,9 @@ from factorgraph_dvl.graph.inertial_chain import InertialChain
 from factorgraph_dvl.graph.keys import STATE_SIZE
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.solvers.correlated_noise import unseen_offsets
-from factorgraph_dvl.solvers.record_scores import record_sums_in_turn, squares_of
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.record_scores import of_whole, record_sums_in_turn, squares_at
 from factorgraph_dvl.statistics.rows import add_transposed_product
-from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # IMU factors that are read at once. Chosen: some ten megabytes.
 _CHUNK = 4096
@@ -47,18 +47,15 @@ class ConsideredError:
     changes: Mapping[int, Array]
 
 
-def considered_errors(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
-) -> tuple[ConsideredError, ...]:
+def considered_errors(problem: Problem, minimum: Minimum) -> tuple[ConsideredError, ...]:
     """Return the errors of a problem that are considered.
 
     Parameters
     ----------
-    problem, evaluation : Problem or Evaluation
+    problem, minimum : Problem or Minimum
         Problem, and its minimum.
-    information : SquareRootInformation
-        Information on all variables there.
     """
+    evaluation, information = minimum.evaluation, minimum.information
     found: list[tuple[str, str, dict[int, Array]]] = []
     chain = problem.chain
     if isinstance(chain, InertialChain) and chain.imu.gravity_deflection_std_arcsec > 0.0:
@@ -71,12 +68,10 @@ def considered_errors(
     for cause, assumed, sums in found:
         changes = information.covariance_with([sums]).times(-1.0)
         out.append(ConsideredError(cause, assumed, changes))
-    return (*out, *_by_windows(problem, evaluation, information))
+    return (*out, *_by_windows(problem, minimum))
 
 
-def _by_windows(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation
-) -> Iterator[ConsideredError]:
+def _by_windows(problem: Problem, minimum: Minimum) -> Iterator[ConsideredError]:
     """Yield the windows over which sensors may average, and that are not estimated.
 
     The root mean square of the square of the length is considered, by what the data say of it.
@@ -89,9 +84,9 @@ def _by_windows(
         if p.mean.any() or not bound.weight.any():
             continue
         unknown = {p.name: np.full(1, np.inf)}
-        squares = squares_of(problem, evaluation, p.name)
-        sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
-        moved = information.covariance_with([sums.by_key])
+        squares = of_whole(p.name, squares_at(problem, bound, minimum))
+        sums = record_sums_in_turn(problem, bound, minimum.evaluation, unknown, squares)
+        moved = minimum.information.covariance_with([sums.by_key])
         taken_up = moved.after(sums.by_key)
         known = max(float((sums.square - taken_up)[0, 0]), 0.0)
         # Means over windows that share pings are rare.

@@ -114,7 +114,7 @@ def with_covariances(
         minimum = minimise_again(problem.values(evaluation.states, origin))
         covariances = considered(problem.chain, posterior(problem, minimum), changes)
         spurious = None
-    errors = considered_errors(problem, minimum.evaluation, covariances.information)
+    errors = considered_errors(problem, minimum)
     covariances = with_errors(problem.chain, covariances, errors)
     return SolvedProblem(problem, minimum, covariances, fixed, findings, spurious)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, auto
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -76,12 +77,15 @@ class Minimum:
         Whether the linear model promises no more.
     iterations : int
         Accepted and refused steps.
+    kept : dict, optional
+        What was worked out there, by name, for whoever asks again.
     """
 
     evaluation: Evaluation
     square_root: SquareRootInformation | None
     converged: bool
     iterations: int
+    kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def information(self) -> SquareRootInformation:

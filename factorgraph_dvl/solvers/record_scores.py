@@ -14,6 +14,7 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.observation_rows import some_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.sensors.protocol import Motion
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.statistics.rows import add_transposed_product
 from factorgraph_dvl.statistics.scores import Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -27,8 +28,8 @@ _BETWEEN = 0.1
 # Standard deviations from which on a misfit is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
 
-# Returns derivatives (M, d, n) of some rows of a record, by name of the parameter.
-Derivatives = Callable[[BoundObservation, Motion], Mapping[str, Array]]
+# Returns derivatives (M, d, n) of some measurements of a record, by name of the parameter.
+Derivatives = Callable[[IntArray, BoundObservation, Motion], Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ def record_sums_in_turn(
     for begin in range(0, count, _CHUNK):
         some = np.arange(begin, min(begin + _CHUNK, count))
         part, motion = part_of(problem, bound, some, evaluation)
-        own = {} if derivatives is None else derivatives(part, motion)
+        own = {} if derivatives is None else derivatives(some, part, motion)
         sums = record_sums(problem, part, evaluation, candidates, motion, own)
         score, square = score + sums.score, square + sums.square
         for key, rows in sums.by_key.items():
@@ -164,9 +165,21 @@ def record_sums_in_turn(
     return RecordSums(score, square, by_key)
 
 
-def squares_of(problem: Problem, evaluation: Evaluation, name: str) -> Derivatives:
-    """Return what gives `by_square` of rows as the derivatives by the length of a window."""
-    return lambda part, _: {name: by_square(problem, part, evaluation)}
+def of_whole(name: str, whole: Array) -> Derivatives:
+    """Return what gives the derivatives of some measurements out of those (M, d, n) of all."""
+    return lambda some, *_: {name: whole[some]}
+
+
+def squares_at(problem: Problem, bound: BoundObservation, minimum: Minimum) -> Array:
+    """Return `by_square` of a whole record at a minimum, worked out once."""
+    name = f"squares of {bound.observation.label}"
+    if name not in minimum.kept:
+        count, evaluation = bound.observation.time.size, minimum.evaluation
+        parts = [np.arange(b, min(b + _CHUNK, count)) for b in range(0, count, _CHUNK)]
+        each = (part_of(problem, bound, some, evaluation)[0] for some in parts)
+        found = [by_square(problem, part, evaluation) for part in each]
+        minimum.kept[name] = np.concatenate(found)
+    return np.asarray(minimum.kept[name])
 
 
 def unexplained(bound: BoundObservation, residual: Array) -> float:
@@ -184,17 +197,13 @@ def unexplained(bound: BoundObservation, residual: Array) -> float:
     return beyond if beyond > _CERTAIN * chance else 0.0
 
 
-def window_part(
-    problem: Problem, bound: BoundObservation, evaluation: Evaluation
-) -> tuple[BoundObservation, Motion, float]:
-    """Return measurements that show a window, their motion, and how many each stands for."""
-    count = bound.observation.time.size
-    some: IntArray = np.arange(count)
-    if count > _ENOUGH:
-        length = _ENOUGH // _STRETCHES
-        first = np.linspace(0, count - length, _STRETCHES).astype(int)
-        some = (first[:, None] + np.arange(length)).ravel()
-    return *part_of(problem, bound, some, evaluation), count / some.size
+def window_part(count: int) -> IntArray:
+    """Return which of so many measurements show a window."""
+    if count <= _ENOUGH:
+        return np.arange(count)
+    length = _ENOUGH // _STRETCHES
+    first = np.linspace(0, count - length, _STRETCHES).astype(int)
+    return (first[:, None] + np.arange(length)).ravel()
 
 
 def part_of(

@@ -22,7 +22,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     noise_of,
@@ -31,7 +31,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
 )
 from factorgraph_dvl.solvers.imu_noise import lower_noise
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, wide
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
@@ -577,9 +577,7 @@ def _between(before: Process, after: Process, share: float) -> Process:
 
 def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
     """Whether a parameter that changed along the trial explains more than correlated noise."""
-    information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
-    tests = component_changes(problem, minimum.evaluation, information)
-    found = [t.change for t in tests if t.change.chi2 > CHANGED**2]
+    found = [t.change for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
     if not found:
         return False
     most = max(found, key=lambda c: c.fall)

@@ -94,7 +94,7 @@ def _by_block(
     """Return scores (K, 2) and information (K, 2, K, 2) of a current of each block of pings."""
     count = starts.size + 1
 
-    def by_blocks(part: BoundObservation, motion: Motion) -> dict[str, Array]:
+    def by_blocks(_: IntArray, part: BoundObservation, motion: Motion) -> dict[str, Array]:
         values, own = evaluation.parameters, part.observation.time
         lin = part.linearized(motion, values, [CURRENT], problem.processes_of(part))
         block = np.searchsorted(starts, own, side="right")

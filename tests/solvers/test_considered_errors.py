@@ -82,7 +82,7 @@ def test_what_residuals_do_not_show_of_positions_moves_the_trajectory_and_nothin
     problem.noise_factors = {"GNSS position": np.array([0.6, 0.6, 1.0])}
     problem.weigh(evaluation)
     minimum = minimise(problem, evaluation.values, stage="as weighed", weighed=True)
-    error, *_ = considered_errors(problem, minimum.evaluation, minimum.information)
+    error, *_ = considered_errors(problem, minimum)
     assert error.cause == "slow errors of GNSS position"
     change = of_states(problem.chain, error.changes)
     moved = minimum.evaluation.states.nRb @ change[:, 3:6]

@@ -40,7 +40,7 @@ def known_of(problem):
     return [
         p
         for p in problem.all_parameters
-        if not (p.estimated or p.spec.usual) and p.spec.plausible is not None
+        if not (p.estimated or p.spec.usual or p.spec.searched) and p.spec.plausible is not None
     ]
 
 

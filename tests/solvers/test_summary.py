@@ -67,7 +67,7 @@ def test_what_the_data_do_not_determine_is_named_with_its_reason():
 def test_a_change_below_the_limit_of_its_parameter_is_a_drift(monkeypatch, size, grade):
     scale = Parameter(SCALE_SPEC, np.zeros(1), np.ones(1))
     change = ComponentChange(scale.name, scale, Change(40.0, 40.0, 50.0, size, 1e-4, np.zeros(1)))
-    monkeypatch.setattr(change_along_trial, "component_changes", lambda *_: [change])
+    monkeypatch.setattr(change_along_trial, "changes_at", lambda *_: [change])
     trial, found = solved.turning()
     verdict = summarise(trial, found, rate_hz=2.0).verdict
     assert verdict.grade == grade
@@ -81,7 +81,7 @@ def test_a_change_beside_the_calibration_counts_as_it_moves_it(monkeypatch, shif
     beside = Change(9.0, 9.0, 50.0, 0.1, 1e-4, np.zeros(2))
     change = Change(40.0, 40.0, 50.0, 0.5, 0.1, np.array([shift, 0.5]))
     tests = [ComponentChange(p.name, p, c) for p, c in ((scale, beside), (bias, change))]
-    monkeypatch.setattr(change_along_trial, "component_changes", lambda *_: tests)
+    monkeypatch.setattr(change_along_trial, "changes_at", lambda *_: tests)
     trial, found = solved.turning()
     verdict = summarise(trial, found, rate_hz=2.0).verdict
     assert verdict.grade == grade
