@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -26,6 +26,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
 from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.solvers.sawtooth import sawtooths
+from factorgraph_dvl.solvers.shape import Shapes, searched
 from factorgraph_dvl.solvers.water_span import water_spans
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_by_source
@@ -139,8 +140,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
-    shape, _ = shapes.get(parameter.name, (None, 0))
-    return Explanation(parameter, test, others, shape)
+    shape = shapes.get(parameter.name)
+    return Explanation(parameter, test, others, None if shape is None else shape.parameter)
 
 
 def _limit(p: Parameter) -> float:
@@ -151,6 +152,27 @@ def _limit(p: Parameter) -> float:
 def evidence(p: Parameter, test: Score) -> float:
     """Return what a parameter takes off the objective if it may be anything plausible."""
     return test.evidence(wide(p, p.mean).sigma)
+
+
+def is_needless(p: Parameter, problem: Problem, minimum: Minimum) -> bool:
+    """Whether the objective is lower without a parameter that was stated for certain.
+
+    It is estimated instead: as more is known, another one may explain what it did.
+
+    Parameters
+    ----------
+    p : Parameter
+        Parameter as it was stated.
+    problem, minimum : Problem or Minimum
+        Problem that estimates it, and its minimum.
+    """
+    value = minimum.evaluation.parameters[p.name]
+    if p.estimated or value.shape != p.mean.shape:
+        return False
+    P = minimum.information.covariance_of([{problem.key(p.name): np.eye(value.size)}])
+    step, std = value - p.mean, np.sqrt(np.diag(P))
+    test = Score(float(step @ np.linalg.solve(P, step)), value.size, step, std)
+    return evidence(p, test) < 0.0
 
 
 def _is_sampling(scale: Score, imu: Imu) -> bool:
@@ -213,7 +235,7 @@ def _tests(
     problem: Problem,
     minimum: Minimum,
     weighed: _Weighed,
-    shapes: Mapping[str, tuple[Parameter, int]],
+    shapes: Shapes,
 ) -> dict[str, tuple[Parameter, Score]]:
     """Return tests of what is taken as known, within a prior or for certain, by name.
 
@@ -238,29 +260,24 @@ def _tests(
     if not known and not of_priors:
         return {}
     at, ratios = weighed.evaluation, weighed.ratios
-    found_shapes = [shape for shape, _ in shapes.values()]
+    found_shapes = [shape.parameter for shape in shapes.values()]
     free = freed(weighed.problem, at, weighed.information, known, weighed.step, found_shapes)
-    out |= {p.name: (p, _searched(free.scores.test([p.name]), p, shapes)) for p in known}
+    out |= {p.name: (p, searched(free.scores.test([p.name]), p.name, shapes)) for p in known}
     # Scores scatter by no less than this.
     least = min([1.0, *(float(np.min(ratio)) ** 2 for ratio in ratios.values())])
     if all(test.divided(least).log10_p >= _limit(p) for p, test in out.values()):
         return out
     others = {p.name: (problem.key(p.name), wide(p, p.mean).sigma) for p in of_priors}
     found, scatter = free.scattered(problem.chain.node_time, ratios, others)
-    out |= {p.name: (p, _searched(found.test([p.name]), p, shapes)) for p in known}
+    out |= {p.name: (p, searched(found.test([p.name]), p.name, shapes)) for p in known}
     return {name: (p, test.divided(scatter[name])) for name, (p, test) in out.items()}
-
-
-def _searched(test: Score, p: Parameter, shapes: Mapping[str, tuple[Parameter, int]]) -> Score:
-    """Return a test as that of the best of all shapes, if its parameter has one."""
-    return test.searched(shapes[p.name][1]) if p.name in shapes else test
 
 
 def _shown_by_records(
     problem: Problem,
     evaluation: Evaluation,
     information: SquareRootInformation,
-    shapes: Mapping[str, tuple[Parameter, int]],
+    shapes: Shapes,
 ) -> list[Parameter]:
     """Return the parameters of one record each that its rows ask for.
 
@@ -271,7 +288,8 @@ def _shown_by_records(
     if problem.chain.interpolates:
         return out
     ratios = _ratios(problem, evaluation)
-    own_shapes = {shape.name: shape.mean for shape, _ in shapes.values()}
+    found_shapes = [shape.parameter for shape in shapes.values()]
+    own_shapes = {p.name: p.mean for p in found_shapes}
     there = replace(evaluation, parameters={**evaluation.parameters, **own_shapes})
     known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
     for bound, at, motion in zip(
@@ -286,7 +304,7 @@ def _shown_by_records(
         found = record_scores(problem, here, there, information, priors, motion)
         variance = float(np.mean(np.square(ratios.get(label, 1.0))))
         for p in own:
-            test = _searched(found.test([p.name]).divided(variance), p, shapes)
+            test = searched(found.test([p.name]).divided(variance), p.name, shapes)
             if test.log10_p < _limit(p):
                 out.append(p)
     return out

@@ -78,7 +78,7 @@ class Minimum:
     iterations : int
         Accepted and refused steps.
     kept : dict, optional
-        What was worked out there, by name, for whoever asks again.
+        What was worked out there, by name: it need not be worked out again.
     """
 
     evaluation: Evaluation

@@ -13,11 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.clock import Clock
-from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.solvers.shape import Shape
 
 # Fewest periods in a trial, and fewest measurements in a period. Chosen: of less, a rate or a jump
 # of the clock, or noise, looks the same.
@@ -28,6 +29,8 @@ _LINES = 3
 _STARTS = (64, 1024, 1024)
 # Periods that are tried around a line, and around the best of them.
 _AROUND = 21
+# Lines beside one, whose median is that of noise. Chosen: harmonics are few of them.
+_BESIDE = 41
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,15 @@ class Sawtooth:
         Fall of the squares of the residuals, nothing else following.
     tried : int
         Periods and starts that could have been it.
+    scatter : float
+        Median power of lines beside it, over that of white noise; at least one.
     """
 
     period: float
     start: float
     fall: float
     tried: int
+    scatter: float
 
 
 def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | None:
@@ -70,7 +76,10 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
     power = np.abs(np.fft.rfft(series)) ** 2
     # Line k has k periods in the trial.
     last = min(power.size, stamps.size // _MEASUREMENTS)
-    lines = float(_PERIODS) + np.argsort(power[_PERIODS:last])[-_LINES:]
+    # Noise that persists has more of slow lines.
+    noise = median_filter(power[_PERIODS:last], _BESIDE, mode="nearest") / np.log(2.0)
+    noise = np.maximum(noise / information.sum(), 1.0)
+    lines = float(_PERIODS) + np.argsort(power[_PERIODS:last] / noise)[-_LINES:]
     if not lines.size:
         return None
     found = []
@@ -82,7 +91,9 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
         lines = tried[best : best + 1]
     fall, phase = found[best]
     period = span / float(lines[0])
-    return Sawtooth(period, float(stamps[0] + phase * period), fall, int(last) * _STARTS[-1])
+    nearest = int(np.clip(round(float(lines[0])) - _PERIODS, 0, noise.size - 1))
+    start, tried_in_all = float(stamps[0] + phase * period), int(last) * _STARTS[-1]
+    return Sawtooth(period, start, fall, tried_in_all, float(noise[nearest]))
 
 
 def _folded(turns: Array, score: Array, information: Array, starts: int) -> tuple[float, float]:
@@ -102,8 +113,8 @@ def _folded(turns: Array, score: Array, information: Array, starts: int) -> tupl
     return float(fall[best]), best / starts
 
 
-def sawtooths(problem: Problem, evaluation: Evaluation) -> dict[str, tuple[Parameter, int]]:
-    """Return the period of each delay that is not estimated, by its name, and how many were tried.
+def sawtooths(problem: Problem, evaluation: Evaluation) -> dict[str, Shape]:
+    """Return the period of each delay that is not estimated, by its name.
 
     Parameters
     ----------
@@ -128,11 +139,11 @@ def sawtooths(problem: Problem, evaluation: Evaluation) -> dict[str, tuple[Param
         by_delay = bound.weight * lin.d_parameters[offset][:, :, 0]
         own = bound.observation.time, -np.sum(by_delay * residual, 1), np.sum(by_delay**2, 1)
         rows.setdefault(clock.sawtooth.name, (clock, []))[1].append(own)
-    out = {}
+    out = dict[str, Shape]()
     for name, (clock, parts) in rows.items():
         found = best_sawtooth(*map(np.concatenate, zip(*parts, strict=True)))
         if found is not None:
             period = every[clock.period.name]
             mean = np.array([found.period, found.start])
-            out[name] = replace(period, mean=mean), found.tried
+            out[name] = Shape(replace(period, mean=mean), found.tried, found.scatter)
     return out

@@ -30,7 +30,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     with_others,
 )
 from factorgraph_dvl.solvers.imu_noise import lower_noise
-from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, wide
+from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, is_needless, wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
@@ -379,7 +379,12 @@ class KnownParametersAgain:
         left beside it contradicts nothing that is stated.
         """
         model, known = at.model, self.known
-        if not at.minimum.converged or known.tested_at - at.objective < _KNOWN_BETTER:
+        if not at.minimum.converged:
+            return
+        for cause in known.estimated_by(model):
+            if is_needless(cause.parameter, at.problem, at.minimum):
+                yield Proposal(_with_others(at, cause.parameter), at.states, at.values)
+        if known.tested_at - at.objective < _KNOWN_BETTER:
             return
         if not self._asked.before(model.parameters, model.processes):
             self._asked.note(model.parameters, model.processes)

@@ -16,26 +16,28 @@ from dataclasses import replace
 
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.geometry.vectors import Array, BoolArray, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.dvl_water import CURRENT, WATER, WATER_SPAN
-from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solvers.record_scores import record_sums_in_turn, unexplained
+from factorgraph_dvl.solvers.shape import Shape
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Steps that are looked at, and pings on each side that show one. Chosen: a span has two, other
 # errors some more; noise of a DVL is averaged, and the IMU drifts by less.
 _STEPS, _SIDE = 8, 30
+# Parts of a record whose scores scatter by noise. Chosen: longer than what persists for seconds.
+_PARTS = 30
 # Share of the largest eigenvalue of information that is known. Chosen: rounding is less.
 _KNOWN = 1e-9
 
 
 def water_spans(
     problem: Problem, evaluation: Evaluation, information: SquareRootInformation
-) -> dict[str, tuple[Parameter, int]]:
-    """Return the span of a current that is not estimated, by its name, and how many were tried.
+) -> dict[str, Shape]:
+    """Return the span of a current that is not estimated, by its name.
 
     Parameters
     ----------
@@ -45,7 +47,7 @@ def water_spans(
         Information on all variables there.
     """
     known = {p.name: p for p in problem.all_parameters}
-    out: dict[str, tuple[Parameter, int]] = {}
+    out = dict[str, Shape]()
     for bound, residual in zip(problem.bound, evaluation.residuals, strict=True):
         time = bound.observation.time
         if (
@@ -56,9 +58,14 @@ def water_spans(
         ):
             first = _first_pings(problem, bound, evaluation)
             i, j = _best(*_by_block(problem, bound, evaluation, information, time[first[1:-1]]))
-            span = np.array([time[first[i]], time[first[j + 1] - 1]])
+            own = first[i], first[j + 1]
+            span = np.array([time[own[0]], time[own[1] - 1]])
+            edges = np.unique([*np.linspace(0, time.size, _PARTS + 1).astype(int), *own])
+            of_parts = _by_block(problem, bound, evaluation, information, time[edges[1:-1]])
+            inside = (edges[:-1] >= own[0]) & (edges[:-1] < own[1])
             # It may begin and end with any ping.
-            out[WATER] = replace(known[WATER_SPAN], mean=span), time.size**2 // 2
+            shape = replace(known[WATER_SPAN], mean=span)
+            out[WATER] = Shape(shape, time.size**2 // 2, _elsewhere(*of_parts, inside))
     return out
 
 
@@ -107,6 +114,23 @@ def _by_block(
     sums = record_sums_in_turn(problem, bound, evaluation, unknown, by_blocks)
     known = sums.square - information.covariance_of([sums.by_key])
     return sums.score.reshape(count, 2), known.reshape(count, 2, count, 2)
+
+
+def _elsewhere(score: Array, information: Array, inside: BoolArray) -> float:
+    """Return the variance of scores of blocks outside a span, over that of white noise.
+
+    At least one. A current of the span has explained what it can.
+    """
+    of_span = information[inside].sum(axis=0)
+    known = np.linalg.pinv(of_span[:, inside].sum(axis=1), _KNOWN, hermitian=True)
+    step = known @ score[inside].sum(axis=0)
+    total = freedom = 0.0
+    for k in np.flatnonzero(~inside):
+        left = score[k] - of_span[:, k].T @ step
+        own = information[k, :, k] - of_span[:, k].T @ known @ of_span[:, k]
+        total += float(left @ np.linalg.pinv(own, _KNOWN, hermitian=True) @ left)
+        freedom += left.size
+    return max(total / freedom, 1.0) if freedom else 1.0
 
 
 def _best(score: Array, information: Array) -> tuple[int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from truth import CONFIGS
+from truth import CONFIGS, config
 
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, parse_scenario, simulate
@@ -27,6 +27,26 @@ def test_the_whole_record_is_no_span():
     information = np.einsum("kl,ab->kalb", 4.0 * np.eye(6), np.eye(2))
     first, last = water_span._best(score, information)
     assert last - first == 4
+
+
+def test_scores_elsewhere_show_how_far_noise_goes():
+    """Blocks of information 4 whose scores are 6 away from the span, by hand: 36 / 4 = 9."""
+    score = np.full((5, 2), 6.0)
+    score[2] = 100.0
+    information = np.einsum("kl,ab->kalb", 4.0 * np.eye(5), np.eye(2))
+    inside = np.array([False, False, True, False, False])
+    assert water_span._elsewhere(score, information, inside) == pytest.approx(9.0)
+    # As little as white noise has is no less.
+    assert water_span._elsewhere(0.1 * score, information, inside) == 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 4])
+def test_noise_that_persists_for_seconds_is_no_water(seed):
+    """With 70 % of the noise over 2 s, a span of 30 s fitted as a current of 5 mm/s."""
+    noise = {"correlated_share": 0.7, "correlation_time_s": 2.0}
+    found = solve(simulate(config("seed-a-phase-90", dvl=noise), seed), rate_hz=1.0)
+    assert found.verdict.grade == "good"
 
 
 @pytest.mark.slow
