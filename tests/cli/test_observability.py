@@ -108,7 +108,7 @@ UNOBSERVABLE = {
 # Much like another one of them.
 VARIANTS = (
     *("straight in a swell", "two seconds adrift", "three scales", "no current"),
-    *("one ping", "walking biases", "gap"),
+    *("one ping", "walking biases", "gap", "without GNSS"),
 )
 
 

@@ -127,6 +127,7 @@ def test_positions_hold_their_standard_deviations_under_slow_errors(tau):
     assert np.sqrt(np.mean(squares)) > 0.6, np.round(squares, 2)
 
 
+@pytest.mark.slow
 def test_what_may_be_averaged_is_considered_until_it_is_stated():
     """The change is that of a window whose length is known, from the same minimum."""
     plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))

@@ -31,6 +31,7 @@ def test_a_straight_run_leaves_both_mirror_images_and_admits_to_it():
     assert np.hypot(*own) < np.hypot(*solution.trajectory.position_std[-1, :2])
 
 
+@pytest.mark.slow
 def test_after_a_turn_by_30_degrees_the_wrong_one_is_dead():
     t = trial(3)
     solution = solve(t, rate_hz=1.0)
