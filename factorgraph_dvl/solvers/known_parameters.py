@@ -26,7 +26,7 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
 from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.solvers.sawtooth import sawtooths
-from factorgraph_dvl.solvers.shape import Shapes, searched
+from factorgraph_dvl.solvers.shape import Shape, Shapes, searched
 from factorgraph_dvl.solvers.water_span import water_spans
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_by_source
@@ -73,20 +73,25 @@ class Explanation:
     others : tuple of str or Message
         Names of those that explain the misfit about as well, `imu.sampling` where that does, and
         changes along the trial that do.
-    shape : Parameter, optional
+    shape : Shape, optional
         What a search found of it: the period of a sawtooth, or the span of water.
     """
 
     parameter: Parameter
     score: Score
     others: tuple[str | Message, ...]
-    shape: Parameter | None = None
+    shape: Shape | None = None
 
     @property
     def freed(self) -> tuple[Parameter, ...]:
         """The parameter, to be estimated, and its shape."""
         freed = wide(self.parameter, self.parameter.mean)
-        return (freed,) if self.shape is None else (freed, self.shape)
+        return (freed,) if self.shape is None else (freed, self.shape.parameter)
+
+    @property
+    def price(self) -> float:
+        """What the objective must fall by if it is estimated."""
+        return 0.0 if self.shape is None else self.shape.price
 
 
 def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanation | None:
@@ -140,8 +145,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
-    shape = shapes.get(parameter.name)
-    return Explanation(parameter, test, others, None if shape is None else shape.parameter)
+    return Explanation(parameter, test, others, shapes.get(parameter.name))
 
 
 def _limit(p: Parameter) -> float:
@@ -372,7 +376,8 @@ def _shape(found: Explanation) -> Message | None:
     """Return what a parameter is that has a shape, None if it has none."""
     if found.shape is None:
         return None
-    values = dict(zip(found.shape.spec.labels, found.shape.mean, strict=True))
+    p = found.shape.parameter
+    values = dict(zip(p.spec.labels, p.mean, strict=True))
     key = "sawtooth.estimated" if "period" in values else "water_span.estimated"
     return message(key, **values)
 

@@ -300,14 +300,14 @@ def _kept(
         last, nearer = nearer, found.objective
         if at.rough and proposal.model is at.model:
             return found, iterations
-        if found.objective >= at.objective:
+        if found.objective + proposal.price >= at.objective:
             continue
         if found.minimum.converged or found.rough or not at.minimum.converged:
             return found, iterations
         # An objective is that of a minimum: where one was not reached, it is still open.
         found = estimated(found.model, found.states, found.values, report, before=found)
         iterations += found.minimum.iterations
-        if found.minimum.converged and found.objective < at.objective:
+        if found.minimum.converged and found.objective + proposal.price < at.objective:
             return found, iterations
     if not at.model.is_applied(at.problem):
         at.model.applied(at.problem)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.statistics.scores import Score
 
@@ -28,6 +30,11 @@ class Shape:
     tried: int
     scatter: float
 
+    @property
+    def price(self) -> float:
+        """What -2 log of the likelihood must fall by, as each of these may be by chance."""
+        return 2.0 * float(np.log(self.tried))
+
 
 Shapes = Mapping[str, Shape]
 
@@ -35,4 +42,4 @@ Shapes = Mapping[str, Shape]
 def searched(test: Score, name: str, shapes: Shapes) -> Score:
     """Return a test as that of the best of all shapes, if its parameter has one."""
     shape = shapes.get(name)
-    return test if shape is None else test.divided(shape.scatter).searched(shape.tried)
+    return test if shape is None else test.divided(shape.scatter).less(shape.price)

@@ -43,8 +43,7 @@ from factorgraph_dvl.statistics.variance_components import variance_components
 _SHARES = (1.0, 0.5, 0.25, 0.125)
 # The same of noise whose estimates fall by less and less. Chosen: three estimates in one.
 _FURTHER = 3.0
-# Parameters that are estimated although they were stated as known. Chosen: a third is a sign that
-# the model is wrong.
+# Most parameters that are estimated although stated as known. Chosen: more make a wrong model.
 _MOST_FREED = 2
 # Variance of the scores, beside that of white noise, that a change may leave to explain what looks
 # like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
@@ -68,6 +67,8 @@ class Proposal:
         Whether the minimisation may end early, as another one follows.
     nearer : bool, default False
         Whether it is on the way to what was proposed before it.
+    price : float, default 0
+        What the objective must fall by, as it is the best of many that were tried.
     """
 
     model: Model
@@ -75,6 +76,7 @@ class Proposal:
     values: dict[str, Array]
     rough: bool = False
     nearer: bool = False
+    price: float = 0.0
 
 
 class Step(Protocol):
@@ -425,7 +427,7 @@ def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     freed = _with_others(at, *cause.freed)
     # What the misfit made of noise and gross errors is to be found anew.
     for model in (freed.as_stated(), freed):
-        yield Proposal(model, at.states, at.values)
+        yield Proposal(model, at.states, at.values, price=cause.price)
 
 
 def _with_others(at: Estimated, *others: Parameter) -> Model:

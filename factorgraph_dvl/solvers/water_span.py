@@ -28,7 +28,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 # Steps that are looked at, and pings on each side that show one. Chosen: a span has two, other
 # errors some more; noise of a DVL is averaged, and the IMU drifts by less.
 _STEPS, _SIDE = 8, 30
-# Parts of a record whose scores scatter by noise. Chosen: longer than what persists for seconds.
+# Most parts of a record whose scores scatter by noise. Chosen: longer than what persists for
+# seconds.
 _PARTS = 30
 # Share of the largest eigenvalue of information that is known. Chosen: rounding is less.
 _KNOWN = 1e-9
@@ -60,13 +61,22 @@ def water_spans(
             i, j = _best(*_by_block(problem, bound, evaluation, information, time[first[1:-1]]))
             own = first[i], first[j + 1]
             span = np.array([time[own[0]], time[own[1] - 1]])
-            edges = np.unique([*np.linspace(0, time.size, _PARTS + 1).astype(int), *own])
+            edges = _parts_beside(*own, time.size)
             of_parts = _by_block(problem, bound, evaluation, information, time[edges[1:-1]])
             inside = (edges[:-1] >= own[0]) & (edges[:-1] < own[1])
             # It may begin and end with any ping.
             shape = replace(known[WATER_SPAN], mean=span)
             out[WATER] = Shape(shape, time.size**2 // 2, _elsewhere(*of_parts, inside))
     return out
+
+
+def _parts_beside(begin: int, end: int, count: int) -> IntArray:
+    """Return where parts begin, and the end: the span, and others as long on both sides of it.
+
+    Errors that persist go with each other over as long.
+    """
+    length = max(end - begin, count // _PARTS)
+    return np.unique([0, *range(begin, 0, -length), *range(end, count, length), count])
 
 
 def _first_pings(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> IntArray:

@@ -44,9 +44,9 @@ class Score:
         with np.errstate(divide="ignore"):
             return float(np.log10(chdtrc(self.freedom, self.chi2)))
 
-    def searched(self, count: int) -> Score:
-        """Return the test of the best of so many shapes of a candidate: each may be by chance."""
-        return replace(self, chi2=max(self.chi2 - 2.0 * float(np.log(count)), 0.0))
+    def less(self, price: float) -> Score:
+        """Return the test with a smaller chi2, as of the best of many that were tried."""
+        return replace(self, chi2=max(self.chi2 - price, 0.0))
 
     def divided(self, scatter: float) -> Score:
         """Return the test where scores scatter more, in variance, than white noise makes them."""

@@ -29,6 +29,12 @@ def test_the_whole_record_is_no_span():
     assert last - first == 4
 
 
+def test_parts_beside_a_span_are_as_long():
+    np.testing.assert_array_equal(water_span._parts_beside(40, 60, 100), [0, 20, 40, 60, 80, 100])
+    # Short ones are as long as what persists for seconds.
+    np.testing.assert_array_equal(water_span._parts_beside(0, 5, 300)[:4], [0, 5, 15, 25])
+
+
 def test_scores_elsewhere_show_how_far_noise_goes():
     """Blocks of information 4 whose scores are 6 away from the span, by hand: 36 / 4 = 9."""
     score = np.full((5, 2), 6.0)
