@@ -111,9 +111,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     time = problem.chain.node_time
     if time[-1] - time[0] < _SHORTEST:
         return None
-    weighed, information = _weighed(problem, minimum), minimum.information
-    shapes = sawtooths(problem, minimum.evaluation)
-    shapes |= water_spans(problem, minimum.evaluation, information)
+    weighed = _weighed(problem, minimum)
+    shapes = _shapes(problem, minimum)
     tests = _tests(problem, minimum, weighed, shapes)
     asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
     shared = np.log10(max(asked, 1))
@@ -146,6 +145,15 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
     return Explanation(parameter, test, others, shapes.get(parameter.name))
+
+
+def _shapes(problem: Problem, minimum: Minimum) -> Shapes:
+    """Return what searches find, where an IMU ties the motion."""
+    if problem.chain.interpolates:
+        return {}
+    evaluation = minimum.evaluation
+    found = sawtooths(problem, evaluation)
+    return found | water_spans(problem, evaluation, minimum.information)
 
 
 def _limit(p: Parameter) -> float:
