@@ -386,7 +386,7 @@ def _shape(found: Explanation) -> Message | None:
         return None
     p = found.shape.parameter
     values = dict(zip(p.spec.labels, p.mean, strict=True))
-    key = "sawtooth.estimated" if "period" in values else "water_span.estimated"
+    key = "estimated_instead.sawtooth" if "period" in values else "estimated_instead.in_water"
     return message(key, **values)
 
 

@@ -23,6 +23,9 @@ from factorgraph_dvl.solvers.shape import Shape
 # Fewest periods in a trial, and fewest measurements in a period. Chosen: of less, a rate or a jump
 # of the clock, or noise, looks the same.
 _PERIODS, _MEASUREMENTS = 4, 4
+# Span over what its measurements take at their interval, from which on a record is in pieces, or
+# its clock jumps. Chosen: the spectrum takes memory for all of the span.
+_SPARSE = 10.0
 # Lines of the spectrum that are folded. Chosen: sway makes others of each.
 _LINES = 3
 # Starts that are tried, first to last. Chosen: at the end, a delay of 0.1 s is known to 0.1 ms.
@@ -57,7 +60,7 @@ class Sawtooth:
 
 
 def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | None:
-    """Return the sawtooth that scores follow best; None where a trial is too short for one.
+    """Return the sawtooth that scores follow best; None of short records, and of those in pieces.
 
     Parameters
     ----------
@@ -71,6 +74,8 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
         return None
     since, span = time - stamps[0], float(np.ptp(stamps))
     interval = float(np.median(np.diff(stamps)))
+    if span > _SPARSE * interval * stamps.size:
+        return None
     places = np.round(since / interval).astype(np.intp)
     series = np.bincount(places, score)
     power = np.abs(np.fft.rfft(series)) ** 2

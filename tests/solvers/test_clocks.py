@@ -38,12 +38,14 @@ def test_a_lag_by_hand():
 
 
 def test_a_velocity_is_late_beside_its_position_by_hand():
-    offset, rate, _ = specs = Gnss.specs[1:4]
-    values = {spec.name: np.array([x]) for spec, x in zip(specs, (0.5, 2e-4, -0.2), strict=True)}
+    offset, rate, sawtooth, period, delay = Gnss.specs[1:6]
+    known = ((offset, 0.5), (rate, 2e-4), (delay, -0.2))
+    values = {spec.name: np.array([x]) for spec, x in known}
     # 0.2 s early beside the lag of 0.51 s that positions have.
-    clock = LateClock(*specs)
+    clock = LateClock(offset, rate, sawtooth, period, delay)
     np.testing.assert_allclose(clock.lag(np.array([150.0]), values, 100.0), [0.31])
-    np.testing.assert_allclose(Clock(offset, rate).lag(np.array([150.0]), values, 100.0), [0.51])
+    of_positions = Clock(offset, rate, sawtooth, period)
+    np.testing.assert_allclose(of_positions.lag(np.array([150.0]), values, 100.0), [0.51])
 
 
 @pytest.mark.slow

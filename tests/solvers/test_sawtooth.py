@@ -65,3 +65,8 @@ def test_noise_pays_for_the_search():
 
 def test_a_few_measurements_show_none():
     assert best_sawtooth(np.arange(10.0), np.ones(10), np.ones(10)) is None
+
+
+def test_a_clock_that_jumps_by_years_shows_none():
+    time = np.append(np.arange(100.0), 1.3e9 + np.arange(100.0))
+    assert best_sawtooth(time, np.ones(200), np.ones(200)) is None
