@@ -231,10 +231,8 @@ def _beside_motion(process: Process, time: Array) -> Process:
     error of 0.7 deg over 300 s took 64 off -2 log of the likelihood of four hours in a seaway, in
     which there was none; with nodes every 100 s it adds 26.
     """
-    active = process.sigma > 0.0
-    tau = float(process.tau[active].min())
-    nodes = node_times(time, tau, process.sigma[active], np.full(int(active.sum()), np.inf))
-    return replace(process, time=nodes)
+    unseen = np.full(process.sigma.size, np.inf)
+    return replace(process, time=_node_times(time, process.sigma, process.tau, unseen))
 
 
 def _node_times(time: Array, sigma: Array, tau: Array, white: Array) -> Array:

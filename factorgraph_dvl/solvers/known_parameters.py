@@ -300,9 +300,7 @@ def _shown_by_records(
     if problem.chain.interpolates:
         return out
     ratios = _ratios(problem, evaluation)
-    found_shapes = [shape.parameter for shape in shapes.values()]
-    own_shapes = {p.name: p.mean for p in found_shapes}
-    there = replace(evaluation, parameters={**evaluation.parameters, **own_shapes})
+    there = _with_shapes(evaluation, [shape.parameter for shape in shapes.values()])
     known = {p.name: p for p in problem.all_parameters if p.spec.of_record and not p.estimated}
     for bound, at, motion in zip(
         problem.bound, evaluation.attached, evaluation.motions, strict=True
@@ -440,8 +438,7 @@ def freed(
     names = {p.name for p in known}
     found = {shape.name: shape for shape in shapes}
     fixed = [found.get(p.name, p) for p in problem.all_parameters if not p.estimated]
-    values = evaluation.parameters | {name: shape.mean for name, shape in found.items()}
-    evaluation = replace(evaluation, parameters=values)
+    evaluation = _with_shapes(evaluation, shapes)
     # Those that are estimated come first, and keep their keys.
     every = [*problem.parameters, *(wide(p, p.mean) if p.name in names else p for p in fixed)]
     columns = {
@@ -468,6 +465,11 @@ def freed(
             )
 
     return parameter_scores(parts, columns, information, step)
+
+
+def _with_shapes(evaluation: Evaluation, shapes: Sequence[Parameter]) -> Evaluation:
+    """Return an evaluation with the shapes that a search found; what has them is zero there."""
+    return replace(evaluation, parameters=evaluation.parameters | {p.name: p.mean for p in shapes})
 
 
 def _blocks(problem: Problem) -> list[slice | None]:

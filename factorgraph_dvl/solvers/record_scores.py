@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -153,9 +153,7 @@ def record_sums_in_turn(
     """
     size = sum(sigma.size for sigma in candidates.values())
     score, square, by_key = np.zeros(size), np.zeros((size, size)), dict[int, Array]()
-    count = bound.observation.time.size
-    for begin in range(0, count, _CHUNK):
-        some = np.arange(begin, min(begin + _CHUNK, count))
+    for some in _in_turn(bound.observation.time.size):
         part, motion = part_of(problem, bound, some, evaluation)
         own = {} if derivatives is None else derivatives(some, part, motion)
         sums = record_sums(problem, part, evaluation, candidates, motion, own)
@@ -163,6 +161,12 @@ def record_sums_in_turn(
         for key, rows in sums.by_key.items():
             by_key[key] = by_key[key] + rows if key in by_key else rows
     return RecordSums(score, square, by_key)
+
+
+def _in_turn(count: int) -> Iterator[IntArray]:
+    """Yield which of so many measurements are there at once."""
+    for begin in range(0, count, _CHUNK):
+        yield np.arange(begin, min(begin + _CHUNK, count))
 
 
 def of_whole(name: str, whole: Array) -> Derivatives:
@@ -174,9 +178,11 @@ def squares_at(problem: Problem, bound: BoundObservation, minimum: Minimum) -> A
     """Return `by_square` of a whole record at a minimum, worked out once."""
     name = f"squares of {bound.observation.label}"
     if name not in minimum.kept:
-        count, evaluation = bound.observation.time.size, minimum.evaluation
-        parts = [np.arange(b, min(b + _CHUNK, count)) for b in range(0, count, _CHUNK)]
-        each = (part_of(problem, bound, some, evaluation)[0] for some in parts)
+        evaluation = minimum.evaluation
+        each = (
+            part_of(problem, bound, some, evaluation)[0]
+            for some in _in_turn(bound.observation.time.size)
+        )
         found = [by_square(problem, part, evaluation) for part in each]
         minimum.kept[name] = np.concatenate(found)
     return np.asarray(minimum.kept[name])

@@ -21,7 +21,7 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.dvl_water import CURRENT, WATER, WATER_SPAN
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.solvers.record_scores import record_sums_in_turn, unexplained
+from factorgraph_dvl.solvers.record_scores import part_of, record_sums_in_turn, unexplained
 from factorgraph_dvl.solvers.shape import Shape
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -82,9 +82,8 @@ def _parts_beside(begin: int, end: int, count: int) -> IntArray:
 def _first_pings(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> IntArray:
     """Return the first ping of each block, and the number of pings, in order."""
     values = evaluation.parameters
-    attached = replace(bound, attachment=bound.attached(values))
-    motion = attached.motion(attached.attachment, evaluation.states, values)
-    lin = attached.linearized(motion, values, [CURRENT], problem.processes_of(bound))
+    whole, motion = part_of(problem, bound, np.arange(bound.observation.time.size), evaluation)
+    lin = whole.linearized(motion, values, [CURRENT], problem.processes_of(bound))
     # Columns are orthogonal, and of unit length but for the scale.
     asked = -np.einsum("mdi,md->mi", lin.d_parameters[CURRENT], lin.residual)
     sums = np.concatenate([np.zeros((1, 2)), np.cumsum(asked, axis=0)])
