@@ -274,14 +274,12 @@ def heading_error(
         e = o + a cos w (t - t0) + b sin w (t - t0)
           + d1 sin h + d2 cos h + d3 sin 2 h + d4 cos 2 h
 
-    The deviation is that of the heading by the compass, as on a deviation card (A. Smith's
-    formula: Admiralty Manual for the Deviations of the Compass). By the true heading, it would
-    stretch the heading, and to a compass a stretched heading looks like a faster turn.
+    The deviation is A. Smith's formula (Admiralty Manual for the Deviations of the Compass).
 
     Parameters
     ----------
     time, heading : ndarray, shape (M,)
-        Times, s, and measured headings, rad.
+        Times, s, and headings of the body, rad.
     values : mapping of str to ndarray
         Heading offset o, Schuler oscillation (a, b) and deviation d by name, rad; those that are
         absent are zero.
@@ -302,6 +300,15 @@ def heading_error(
     for name, matrix in by.items():
         total += matrix @ values[name]
     return total, by
+
+
+def heading_error_slope(heading: Array, values: Values) -> Array:
+    """Return the derivative of `heading_error` by the heading, (M,): that of the deviation."""
+    if DEVIATION not in values:
+        return np.zeros(heading.size)
+    sin, cos, sin_2, cos_2 = values[DEVIATION]
+    once = sin * np.cos(heading) - cos * np.sin(heading)
+    return np.asarray(once + 2.0 * (sin_2 * np.cos(2.0 * heading) - cos_2 * np.sin(2.0 * heading)))
 
 
 def dense_angles(
@@ -343,6 +350,10 @@ def dense_angles(
 @dataclass(frozen=True)
 class AttitudeAngles(ObservationByRows):
     """Roll, pitch and heading; zero error where measured = angles of nRb + heading error.
+
+    The deviation of a compass is that at the heading of the body. One of the measured heading
+    would need the density of the numbers as recorded: without it, a deviation that undoes the
+    turns of a ship makes its motion smoother, and so likelier.
 
     Parameters
     ----------
@@ -386,18 +397,23 @@ class AttitudeAngles(ObservationByRows):
     def linearize(self, motion: Motion, values: Values, wanted: Collection[str]) -> Linearization:
         """Return the residual and its Jacobians."""
         residual, rph, by = self._predict(motion, values)
+        by_rotation = rph_jacobian(rph, self.body_axes)
+        by_rotation[:, 2] *= 1.0 + heading_error_slope(rph[:, 2], self._own(values))[:, None]
         found = {}
         for name in self.parameters:
             if name in wanted:
                 found[name] = np.zeros((*residual.shape, by[name].shape[1]))
                 found[name][:, 2] = by[name]
-        return Linearization(residual, rph_jacobian(rph, self.body_axes), d_parameters=found)
+        return Linearization(residual, by_rotation, d_parameters=found)
 
     def _predict(self, motion: Motion, values: Values) -> tuple[Array, Array, dict[str, Array]]:
         lat, lon, _ = self.frame.geodetic(motion.p_n)
         lRb = self.frame.level_from_tangent(lat, lon) @ motion.nRb
         rph = rph_from_rotation(lRb, self.body_axes)
-        own = {name: values[name] for name in self.parameters if name in values}
-        lasting, by = heading_error(self.time, self.measured[:, 2], own, 0.0)
+        lasting, by = heading_error(self.time, rph[:, 2], self._own(values), 0.0)
         predicted = rph + lasting[:, None] * np.array([0.0, 0.0, 1.0])
         return wrapped(predicted - self.measured), rph, by
+
+    def _own(self, values: Values) -> dict[str, Array]:
+        """Return the values of the errors of this heading."""
+        return {name: values[name] for name in self.parameters if name in values}
