@@ -299,17 +299,27 @@ class Problem:
             imu,
         )
 
+    def attach_as(self, other: Problem, evaluation: Evaluation) -> None:
+        """Take the places on the chain from another problem with these nodes, as evaluated."""
+        self._attachments = {
+            other.place(bound, evaluation.parameters): at
+            for bound, at in zip(other.bound, evaluation.attached, strict=True)
+        }
+
+    def place(self, bound: BoundObservation, parameters: Mapping[str, Array]) -> Hashable:
+        """Return what decides where measurements are attached to the chain."""
+        shift, times = self.chain.shift(parameters), bound.times(parameters)
+        return bound.of_attitude, shift, times.tobytes(), bound.window(parameters)
+
     def _attached_at(self, parameters: dict[str, Array]) -> list[Any]:
         """Return where observations are attached to the chain.
 
         Those at the same times have the same attachment, until a clock moves them.
         """
-        shift = self.chain.shift(parameters)
         found: dict[Hashable, Any] = {}
         out = []
         for bound in self._bound:
-            window = bound.window(parameters)
-            own = (bound.of_attitude, shift, bound.times(parameters).tobytes(), window)
+            own = self.place(bound, parameters)
             if own not in found:
                 at = self._attachments.get(own)
                 found[own] = bound.attached(parameters) if at is None else at

@@ -16,7 +16,7 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
-from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, squares_of
+from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, sampled_segments, squares_of
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
@@ -207,8 +207,9 @@ def _squares(
     sources: Iterable[str],
 ) -> tuple[float, float]:
     """Return the squares of residuals of some sources together, and what they are by chance."""
+    every = sampled_segments(problem)
     squares, freedom = np.sum(
-        [*squares_of(problem, evaluation, information, sources).values()], axis=0
+        [*squares_of(problem, evaluation, information, sources, every).values()], axis=0
     )
     return float(squares), float(freedom)
 

@@ -1,12 +1,13 @@
-"""Noise of the IMU below what is stated, from what the motion between states shows of it.
+"""Noise of the IMU between what is stated and what its record has, from the motion between states.
 
-The record bounds the noise from above (`imu.noise`); a data sheet may state ten times as much. The
-IMU then counts for too little, and errors of other sensors take its place.
+The record bounds the noise from above (`imu.noise`): what vibrates at high frequencies is part of
+it. What is stated bounds it from below. An INS that is made of the same record agrees with it to
+a tenth of the noise that both have; its residuals say nothing of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 
 import numpy as np
 
@@ -22,7 +23,7 @@ IMU_NOISE = (GYRO_NOISE, ACCEL_NOISE)
 # Segments from which the noise is estimated. Chosen: it is then known to some per cent.
 _SEGMENTS = 500
 # Keys of the settings that state each of them.
-_KEYS = {GYRO_NOISE: "gyro_noise_deg_sqrt_h", ACCEL_NOISE: "accel_noise_ug_sqrt_hz"}
+NOISE_KEYS = {GYRO_NOISE: "gyro_noise_deg_sqrt_h", ACCEL_NOISE: "accel_noise_ug_sqrt_hz"}
 
 
 def squares_of(
@@ -62,8 +63,13 @@ def squares_of(
     return {name: (squares[name], max(freedom[name], 0.0)) for name in squares}
 
 
-def lower_noise(problem: Problem, minimum: Minimum) -> dict[str, float]:
-    """Return factors below 1 on stated noise of the IMU, by key of its settings.
+def sampled_segments(problem: Problem) -> int:
+    """Return of how many segments one shows the noise of the IMU well enough."""
+    return max(problem.chain.count // _SEGMENTS, 1)
+
+
+def lower_noise(problem: Problem, minimum: Minimum, sources: Collection[str]) -> dict[str, float]:
+    """Return factors below 1 on the noise of the IMU, by key of its settings.
 
     By the fixed point of the restricted likelihood, as of other sensors (`variance_components`);
     those that may be chance are left out.
@@ -74,12 +80,14 @@ def lower_noise(problem: Problem, minimum: Minimum) -> dict[str, float]:
         What was minimised.
     minimum : Minimum
         Where it ended.
+    sources : collection of str
+        `GYRO_NOISE` or `ACCEL_NOISE`, or both.
     """
-    every = max(problem.chain.count // _SEGMENTS, 1)
-    found = squares_of(problem, minimum.evaluation, minimum.information, IMU_NOISE, every)
+    every = sampled_segments(problem)
+    found = squares_of(problem, minimum.evaluation, minimum.information, sources, every)
     out = {}
     for source, (squares, freedom) in found.items():
         factor = float(NoiseFactor.of(squares, freedom).after(np.ones(1))[0])
         if factor < 1.0:
-            out[_KEYS[source]] = factor
+            out[NOISE_KEYS[source]] = factor
     return out

@@ -543,6 +543,8 @@ def with_parameters(
     test.noise_factors = problem.noise_factors
     test.robust_weights = robust
     test.long_run = problem.long_run
+    if block is None:
+        test.attach_as(problem, evaluation)
     for bound in test.bound:
         bound.weight = weights[bound.observation.label]
     return test, test.evaluate(test.values(evaluation.states, test.prior_values() | values))

@@ -29,7 +29,7 @@ from factorgraph_dvl.solvers.correlated_noise import (
     with_closer_nodes,
     with_others,
 )
-from factorgraph_dvl.solvers.imu_noise import lower_noise
+from factorgraph_dvl.solvers.imu_noise import NOISE_KEYS, lower_noise
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, is_needless, wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model
@@ -475,7 +475,7 @@ class Noise:
 
 
 class ImuNoise:
-    """Noise of gyros and accelerometers below what is stated, by restricted likelihood."""
+    """Noise of gyros and accelerometers of a record that is noisier than stated."""
 
     name = "noise of the IMU"
 
@@ -484,16 +484,16 @@ class ImuNoise:
         prepared = at.model.prepared
         if not (isinstance(prepared, Preparation) and at.minimum.converged):
             return
-        imu = prepared.trial.inertial
-        if not prepared.trial.estimates_noise(imu):
-            return
-        found = lower_noise(at.problem, at.minimum)
+        used, stated = prepared.trial.inertial.settings, prepared.stated_imu
+        larger = [s for s, k in NOISE_KEYS.items() if getattr(used, k) > getattr(stated, k)]
+        found = lower_noise(at.problem, at.minimum, larger) if larger else {}
         if not found:
             return
         # What is left of an estimate falls by a part of it each time.
         for share in (_FURTHER, *_SHARES):
             keys = {
-                key: getattr(imu.settings, key) * factor**share for key, factor in found.items()
+                key: max(getattr(used, key) * factor**share, getattr(stated, key))
+                for key, factor in found.items()
             }
             less = prepared.with_imu(**keys)
             chain = less.chain(at.states)

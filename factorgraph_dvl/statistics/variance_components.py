@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -47,8 +46,6 @@ class NoiseFactor:
     @classmethod
     def of(cls, squares: float, freedom: float) -> NoiseFactor:
         """Return the factor of one component from squares of its residuals and their freedom."""
-        if freedom < LEAST_REDUNDANCY:
-            return cls(np.ones(1), np.array([freedom]))
         found = np.sqrt((squares + _PRIOR_FREEDOM) / (freedom + _PRIOR_FREEDOM))
         return cls(np.array([max(found, LEAST_FACTOR)]), np.array([freedom]))
 
@@ -110,8 +107,8 @@ def variance_components(
         if o.label in estimated
     )
     found: dict[str, list[tuple[Array, Array]]] = {}
-    own = partial(filter, lambda rows: rows.source in estimated)
-    for rows, h in leverage(lambda: own(problem.observation_rows(evaluation)), count, information):
+    own = [each for each in problem.observation_rows(evaluation) if each.source in estimated]
+    for rows, h in leverage(lambda: own, count, information):
         found.setdefault(rows.source, []).append((rows.vector, h))
     return {
         label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))

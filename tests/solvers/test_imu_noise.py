@@ -10,8 +10,9 @@ from msgspec import structs
 from truth import scenario
 
 from factorgraph_dvl.graph.inertial_chain import ACCEL_NOISE, GYRO_NOISE
+from factorgraph_dvl.imu.noise import with_recorded_noise
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solve, solved_problems
+from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.imu_noise import lower_noise, squares_of
 from factorgraph_dvl.statistics.variance_components import NoiseFactor
 
@@ -40,20 +41,32 @@ def assumed(trial):
     return solved.problem.chain.imu.accel_noise_ug_sqrt_hz, solved
 
 
-def test_noise_that_is_stated_too_large_is_found(trial):
+def test_noise_is_no_less_than_stated(trial):
+    """An INS that was made of the same record would agree with it better than by its noise."""
     right, _ = assumed(trial)
     assert right == pytest.approx(100.0, rel=0.05)
     found, solved = assumed(stated(trial, 10.0))
-    assert found == pytest.approx(100.0, rel=0.2)
+    assert found == 1000.0
+    assert "noise of the IMU" not in [step.change for step in solved.steps]
+
+
+def vibrating(trial):
+    """Return a trial whose accelerometers have 20 times the noise at high frequencies alone."""
+    imu = trial.imu
+    dt = float(np.median(np.diff(imu.time)))
+    velocity = 20.0 * imu.settings.accel_noise_root_psd * np.sqrt(dt)
+    velocity = velocity * np.random.default_rng(5).standard_normal(imu.accel.shape)
+    return replace(trial, imu=replace(imu, accel=imu.accel + np.gradient(velocity, dt, axis=0)))
+
+
+def test_noise_of_a_record_is_what_motion_shows_of_it(trial):
+    """What vibrates bounds the noise from above, and hardly moves the vehicle."""
+    shaking = vibrating(trial)
+    recorded = with_recorded_noise(shaking.imu).settings.accel_noise_ug_sqrt_hz
+    found, solved = assumed(shaking)
+    assert recorded > 200.0
+    assert 100.0 <= found < 0.7 * recorded
     assert "noise of the IMU" in [step.change for step in solved.steps]
-
-
-@pytest.mark.slow
-def test_standard_deviations_are_those_of_the_right_noise(trial):
-    one, other = (solve(each, rate_hz=1.0) for each in (trial, stated(trial, 10.0)))
-    sigma = [np.sqrt(np.diag(each.covariance)) for each in (one, other)]
-    # In a minute the noise is known to a seventh.
-    np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.15)
 
 
 def test_noise_that_is_stated_is_kept(trial):
@@ -73,7 +86,7 @@ def test_sources_have_rows_of_their_own(trial):
     assert squares < 0.1 * freedom
     # No sensor measures a turn of a second as well as the gyros.
     assert found[GYRO_NOISE][1] < 1.0
-    factors = lower_noise(problem, minimum)
+    factors = lower_noise(problem, minimum, (GYRO_NOISE, ACCEL_NOISE))
     assert list(factors) == ["accel_noise_ug_sqrt_hz"]
 
 
@@ -81,5 +94,8 @@ def test_a_factor_by_hand():
     # Prior: 0.414 degrees of freedom at a factor of 1.
     factor = NoiseFactor.of(25.0, 100.0)
     assert factor.factor[0] == pytest.approx(np.sqrt((25.0 + 0.4143) / (100.0 + 0.4143)), rel=1e-4)
-    assert NoiseFactor.of(1.0, 5.0).factor[0] == 1.0
+    few = NoiseFactor.of(1.0, 5.0)
+    assert few.factor[0] == pytest.approx(np.sqrt(1.4143 / 5.4143), rel=1e-4)
+    # Half the noise with 5 degrees of freedom: 2 sigma are 0.63.
+    assert few.after(np.ones(1))[0] == 1.0
     assert NoiseFactor.of(1e-6, 1e4).factor[0] == 0.1
