@@ -23,7 +23,7 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 _CHUNK = 4096
 # Measurements that show a window, and in how many stretches. Chosen: a quarter of a second.
 _ENOUGH, _STRETCHES = 10_000, 20
-# Time between the slopes that show a curvature, s. Chosen: no window is shorter.
+# Time between values that show a curvature, s. Chosen: they are the mean over 0.3 s within 2 %.
 _BETWEEN = 0.1
 # Standard deviations from which on a misfit is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
@@ -233,19 +233,18 @@ def part_of(
 def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
     """Return derivatives (M, d, 1) of measurements by the square of the length of a window, 1/s².
 
-    Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt². The slope
-    of ρ at both ends of a short window is that by a clock.
+    Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt².
     """
-    values, chain, clock = evaluation.parameters, bound.chain, bound.observation.clock
-    assert clock is not None
-    offset, time = clock.names[0], bound.times(values)
-    slopes, covered = [], np.ones(time.size, dtype=bool)
-    for sign in (-0.5, 0.5):
-        when = time + sign * _BETWEEN
-        motion = bound.motion(chain.attach(when, chain.shift(values)), evaluation.states, values)
-        lin = bound.linearized(motion, values, [offset], problem.processes_of(bound))
-        slopes.append(-lin.d_parameters[offset])
+    values, chain = evaluation.parameters, bound.chain
+    time, shift = bound.times(values), chain.shift(values)
+    covered = np.ones(time.size, dtype=bool)
+    out: Array | float = 0.0
+    for weight, apart in ((1.0, -_BETWEEN), (-2.0, 0.0), (1.0, _BETWEEN)):
+        when = time + apart
+        motion = bound.motion(chain.attach(when, shift), evaluation.states, values)
+        predicted = bound.residual(motion, values, problem.processes_of(bound))
+        out = out + weight * predicted
         covered &= chain.covers(when)
-    out = (slopes[1] - slopes[0]) / (24.0 * _BETWEEN)
+    out = np.asarray(out) / (24.0 * _BETWEEN**2)
     out[~covered] = 0.0
-    return out
+    return out[:, :, None]
