@@ -147,8 +147,11 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
 
     The difference x - x0 of posterior and prior has the variance σ0² - σ²; without the prior
     x would be (x - x0) σ² / (σ0² - σ²) further deviation. The standard deviations by which other
-    parameters would move are fewer.
+    parameters would move are fewer. What is usual of a sensor that nothing is stated of, as the
+    window over which it averages, is no prior that data contradict.
     """
+    if e.spec.usual:
+        return []
     informed = e.std < _INFORMED * e.prior_std
     if not informed.any():
         return []

@@ -241,7 +241,8 @@ def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation)
     out: Array | float = 0.0
     for weight, apart in ((1.0, -_BETWEEN), (-2.0, 0.0), (1.0, _BETWEEN)):
         when = time + apart
-        motion = bound.motion(chain.attach(when, shift), evaluation.states, values)
+        at = chain.attach(when, shift) if apart else bound.attachment
+        motion = bound.motion(at, evaluation.states, values)
         predicted = bound.residual(motion, values, problem.processes_of(bound))
         out = out + weight * predicted
         covered &= chain.covers(when)

@@ -81,6 +81,27 @@ def test_a_window_that_is_not_stated_is_found():
     assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
 
 
+@pytest.mark.parametrize("grade", ["tactical", "mems"])
+def test_noise_of_gyros_hides_no_window(grade):
+    """Their noise was most of the curvature by which a window shows, and hid half a second."""
+    plan = plan_in_swell()
+    mix = yaml.safe_load((CONFIGS / f"data-sheet-mix-{grade}.yaml").read_text(encoding="utf-8"))
+    plan["imu"] = {k: v for k, v in mix["imu"].items() if not k.startswith("time_offset")}
+    del plan["trial"]["imu"]
+    plan["dvl"]["averaging_s"] = 0.5
+    trial = simulate(parse_scenario(plan), 1)
+    found = solve(trial)
+    assert found.verdict.grade == "good"
+    assert abs(found.estimate("averaging_s").value[0] - 0.5) < 0.05
+    assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
+
+
+def test_a_long_window_is_no_contradiction():
+    found = solve(trial_of(2.0, 1))
+    assert found.estimate("averaging_s").value[0] == pytest.approx(2.0, abs=0.02)
+    assert not {Code.FAR_FROM_PRIOR} & {f.code for f in found.findings}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("length_s", [0.0, 0.1, 0.2, 0.5, 1.0, 2.0])
 def test_standard_deviations_hold_whatever_the_window(length_s):

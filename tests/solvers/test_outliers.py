@@ -137,7 +137,7 @@ def exact_errors(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
-    [c if c in ("false lock", "all") else pytest.param(c, marks=pytest.mark.study) for c in CASES],
+    [c if c == "all" else pytest.param(c, marks=pytest.mark.study) for c in CASES],
 )
 def test_errors_are_those_of_clean_data(case):
     own, reference, shares = [], [], []

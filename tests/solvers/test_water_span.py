@@ -56,7 +56,7 @@ def test_noise_that_persists_for_seconds_is_no_water(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
 def test_a_layer_of_water_below_is_named_and_estimated(seed):
     """Without GNSS for thirteen minutes, a third of the trial looked like wrong fixes."""
     plan = yaml.safe_load((CONFIGS / "dive.yaml").read_text(encoding="utf-8"))
