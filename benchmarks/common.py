@@ -89,7 +89,7 @@ def _given(options: dict[str, Any]) -> Iterable[str]:
             yield flag
         elif isinstance(value, list):
             yield from (f"{flag} {each}" for each in value)
-        elif value not in (None, False):
+        elif value not in (None, False, ""):
             yield f"{flag} {value}"
 
 

@@ -101,7 +101,7 @@ ROWS = (
         "m/s",
         (0.1, 0.5),
         lambda x: [f.dvl_water_track((0.8 * x, 0.6 * x, 0.0))],
-        (gross("DVL"), r"^changed_along_trial[^:]*(dvl|scale|misalignment)"),
+        (r"water_current", gross("DVL"), r"^changed_along_trial[^:]*(dvl|scale|misalignment)"),
     ),
     Row("DVL: frozen", "s", (5.0, 30.0, 120.0), lambda x: [f.frozen("dvl", x)], (gross("DVL"),)),
     Row(

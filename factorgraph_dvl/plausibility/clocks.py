@@ -77,7 +77,9 @@ def clock_findings(
             severity="error",
         )
     off = clock.offset - mean
-    if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma):
+    # What a window hides of sway looks like a delay by less than half of it.
+    hidden = 0.5 * sensor.settings.velocity_window_s
+    if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma, hidden):
         stated = sensor.settings.time_offset_s
         offset = stated + off
         yield Finding(

@@ -13,6 +13,8 @@ from scipy.stats import chi2
 from truth import CONFIGS, scenario
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.initialization.clock_offsets import ClockOffset
+from factorgraph_dvl.plausibility.clocks import clock_findings
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
@@ -100,6 +102,15 @@ def test_a_long_window_is_no_contradiction():
     found = solve(trial_of(2.0, 1))
     assert found.estimate("averaging_s").value[0] == pytest.approx(2.0, abs=0.02)
     assert not {Code.FAR_FROM_PRIOR} & {f.code for f in found.findings}
+
+
+def test_what_a_window_hides_is_no_clock():
+    """Sway of 0.4 Hz is nearly gone in a mean over two seconds: a delay of 0.2 s seemed to be."""
+    trial = trial_of(2.0, 1, averaging_s=2.0, averaging_std_s=0.0)
+    clock = ClockOffset(0.2, 0.03, 0.0, 0.0, 0.0, 0.0, np.nan, 0.0, 100.0, 0.1)
+    assert not [*clock_findings(trial.dvl, clock, 450.0)]
+    unstated = trial_of(2.0, 1)
+    assert [f.code for f in clock_findings(unstated.dvl, clock, 450.0)] == [Code.CLOCK_OFFSET]
 
 
 @pytest.mark.slow
