@@ -60,7 +60,8 @@ INTRODUCTION = """\
 
 A DVL averages over a window, in roll and pitch of 4° at one frequency of 0.12 to 0.2 Hz and 2° at
 one of 0.25 to 0.5 Hz, others for each seed. NEES/7 is that of misalignment, scale and lever arm:
-the mean of the runs that are graded good, and the mean of all. 99 % of right covariances have a mean within the band.
+the mean of the runs that are graded good, and the mean of all. 99 % of right covariances have a
+mean within the band.
 σ is the largest of these seven over that of the same trial without a window, where both state it.
 The window's errors are over their σ, where it was estimated.
 

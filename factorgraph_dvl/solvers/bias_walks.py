@@ -17,7 +17,7 @@ from factorgraph_dvl.sensors.imu import BIASES, ImuSettings
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
 from factorgraph_dvl.solvers.imu_noise import IMU_NOISE, sampled_segments, squares_of
-from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized, minimise
+from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, minimise
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -95,8 +95,7 @@ def bias_walks(
     report : callable
         Called with stage, iteration and cost.
     """
-    information = minimum.square_root or factorized(problem, minimum.evaluation)[0]
-    if not _walks(prepared.trial.inertial.settings, problem, minimum, information):
+    if not _walks(prepared.trial.inertial.settings, problem, minimum):
         return None
     start = minimum.evaluation
     largest = _walked(prepared, problem, start, _START, noise, report)
@@ -214,9 +213,7 @@ def _squares(
     return float(squares), float(freedom)
 
 
-def _walks(
-    imu: ImuSettings, problem: Problem, minimum: Minimum, information: SquareRootInformation
-) -> bool:
+def _walks(imu: ImuSettings, problem: Problem, minimum: Minimum) -> bool:
     """Whether a bias that is stated as constant changes, or the IMU does not fit its walks."""
     if any(
         c.parameter.name in BIASES and c.change.chi2 > CHANGED**2
@@ -225,7 +222,7 @@ def _walks(
         return True
     walking = [WALK.format(bias) for name, bias in _WALKS.items() if getattr(imu, name) > 0.0]
     sources = [*IMU_NOISE, *walking]
-    squares = _squares(problem, minimum.evaluation, information, sources)
+    squares = _squares(problem, minimum.evaluation, minimum.information, sources)
     return bool(walking) and _is_not_noise(*squares)
 
 

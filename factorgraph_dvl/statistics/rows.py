@@ -143,7 +143,7 @@ def native_rows(problem: Problem, evaluation: Evaluation, every: int = 1) -> Ite
     evaluation : Evaluation
         Where the graph is linear.
     every : int, default 1
-        One of so many factors is taken, from the first on.
+        The factors of one of so many nodes are taken, from the first on.
     """
     yield from problem.chain_rows(evaluation)
     gaussian = problem.native(evaluation)
@@ -152,9 +152,11 @@ def native_rows(problem: Problem, evaluation: Evaluation, every: int = 1) -> Ite
     of_chain = ", ".join(p.name for p, _, _ in problem.chain.mean_constants(evaluation.states))
     names |= {p.key(j): p.label for p in problem.processes for j in range(p.time.size)}
     found: dict[tuple[str, tuple[int, ...]], list[tuple[list[int], Array]]] = {}
-    for i in range(0, gaussian.size(), every):
+    for i in range(gaussian.size()):
         factor = gaussian.at(i)
         own = list(factor.keys())
+        if keys.index_of(own[0]) % every:
+            continue
         kind = (_source(own, names, of_chain), tuple(sizes[key] for key in own))
         items = found.setdefault(kind, [])
         items.append((own, np.array(factor.augmentedJacobian())))

@@ -9,8 +9,9 @@ import pytest
 from msgspec import structs
 from truth import scenario
 
-from factorgraph_dvl.graph.inertial_chain import ACCEL_NOISE, GYRO_NOISE
+from factorgraph_dvl.graph.inertial_chain import ACCEL_NOISE, GYRO_NOISE, WALK
 from factorgraph_dvl.imu.noise import with_recorded_noise
+from factorgraph_dvl.sensors.imu import BIASES
 from factorgraph_dvl.simulation import simulate
 from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.imu_noise import lower_noise, squares_of
@@ -88,6 +89,19 @@ def test_sources_have_rows_of_their_own(trial):
     assert found[GYRO_NOISE][1] < 1.0
     factors = lower_noise(problem, minimum, (GYRO_NOISE, ACCEL_NOISE))
     assert list(factors) == ["accel_noise_ug_sqrt_hz"]
+
+
+def test_one_of_some_nodes_has_all_sources():
+    """Walks of biases stand between the factors of the IMU: every other factor is none of them."""
+    walk = {"gyro_bias_walk_deg_h_sqrt_h": 1.0, "accel_bias_walk_ug_sqrt_h": 100.0}
+    solved, *_ = solved_problems(simulate(scenario(noise=True, imu=walk), seed=3))
+    problem, minimum = solved.problem, solved.minimum
+    sources = (GYRO_NOISE, ACCEL_NOISE, *map(WALK.format, BIASES))
+    at = problem, minimum.evaluation, minimum.information, sources
+    every, some = squares_of(*at), squares_of(*at, every=2)
+    for source in (ACCEL_NOISE, *map(WALK.format, BIASES)):
+        squares, freedom = every[source]
+        assert some[source] == pytest.approx((squares / 2.0, freedom / 2.0), rel=0.3, abs=1.0)
 
 
 def test_a_factor_by_hand():
