@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.special import ndtri
 
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Problem
-from factorgraph_dvl.message import message
+from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.averaging import WINDOW_KEY
 from factorgraph_dvl.sensors.parameters import Parameter
+from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solvers.known_parameters import evidence
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
@@ -125,6 +128,34 @@ def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Find
                 text = message(key, sensor=label, length=length, std=std)
                 out.append(Finding(Code.AVERAGING, text, sensor=label, parameter=name))
     return tuple(out)
+
+
+def without_hidden(
+    errors: Iterable[Finding], aids: Iterable[Aid], estimates: Iterable[Estimate]
+) -> tuple[Finding, ...]:
+    """Return errors in records less those of clocks that a window explains.
+
+    What a mean hides of sway looks like a delay by less than half of the window.
+
+    Parameters
+    ----------
+    errors : iterable of Finding
+        Errors in the records.
+    aids : iterable of Aid
+        Sensors that may average.
+    estimates : iterable of Estimate
+        What was estimated, windows among them.
+    """
+    found = {e.name: float(e.value[0]) for e in estimates if e.name.endswith(WINDOW_KEY)}
+    lengths = {a.label: found[p.name] for a in aids for p in a.parameters() if p.name in found}
+    return tuple(f for f in errors if not _delay(f) < 0.5 * lengths.get(f.sensor, 0.0))
+
+
+def _delay(found: Finding) -> float:
+    """Return by how much a clock is off, s; infinite where that is not what was found."""
+    values = dict(found.message.values) if isinstance(found.message, Message) else {}
+    size = values.get("size")
+    return size if found.code == Code.CLOCK_OFFSET and isinstance(size, float) else np.inf
 
 
 def _length(bound: BoundObservation) -> str:

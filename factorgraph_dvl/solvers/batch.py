@@ -17,6 +17,7 @@ from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.solution import Progress, Solution
+from factorgraph_dvl.solvers.averaging import without_hidden
 from factorgraph_dvl.solvers.calibration import calibration
 from factorgraph_dvl.solvers.curved_posterior import points_along_arc
 from factorgraph_dvl.solvers.fixed_directions import (
@@ -123,7 +124,8 @@ def solve_with_problem(
     with explained(errors):
         prepared = _prepared(trial, state_interval_s, report)
         found, solved = _most_probable(trial, prepared, rate_hz, report)
-    return found.with_findings(errors), solved
+    kept = without_hidden(errors, trial.aids, found.estimates)
+    return found.with_findings(kept), solved
 
 
 def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:

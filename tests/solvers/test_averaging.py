@@ -13,11 +13,13 @@ from scipy.stats import chi2
 from truth import CONFIGS, scenario
 
 from factorgraph_dvl.analysis.error_statistics import calibration_errors
+from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.initialization.clock_offsets import ClockOffset
 from factorgraph_dvl.plausibility.clocks import clock_findings
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.averaging import without_hidden
 from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.record_scores import by_square
 
@@ -104,13 +106,23 @@ def test_a_long_window_is_no_contradiction():
     assert not {Code.FAR_FROM_PRIOR} & {f.code for f in found.findings}
 
 
+def estimated_window(length_s):
+    one = np.ones(1)
+    name = ("averaging_s",)
+    return Estimate(*name, name, length_s * one, 0.01 * one, 0.0 * one, one, one > 0.0)
+
+
 def test_what_a_window_hides_is_no_clock():
     """Sway of 0.4 Hz is nearly gone in a mean over two seconds: a delay of 0.2 s seemed to be."""
     trial = trial_of(2.0, 1, averaging_s=2.0, averaging_std_s=0.0)
     clock = ClockOffset(0.2, 0.03, 0.0, 0.0, 0.0, 0.0, np.nan, 0.0, 100.0, 0.1)
     assert not [*clock_findings(trial.dvl, clock, 450.0)]
     unstated = trial_of(2.0, 1)
-    assert [f.code for f in clock_findings(unstated.dvl, clock, 450.0)] == [Code.CLOCK_OFFSET]
+    found = [*clock_findings(unstated.dvl, clock, 450.0)]
+    assert [f.code for f in found] == [Code.CLOCK_OFFSET]
+    length = estimated_window(2.0)
+    assert without_hidden(found, unstated.aids, [length]) == ()
+    assert without_hidden(found, unstated.aids, [replace(length, value=np.array([0.3]))])
 
 
 @pytest.mark.slow
