@@ -1,9 +1,9 @@
 """A DVL that averages, stated or not, in three motions and a mixed sea.
 
-    python benchmarks/windows.py [--seeds 20] [--jobs 2] [--only REGEX] [--out DIR]
+    python benchmarks/averaging.py [--seeds 20] [--jobs 2] [--only REGEX] [--out DIR]
 
-writes `windows.md` into out/benchmarks, or with `--out docs` that of the documentation. Runs that
-are done are kept in `windows.jsonl` beside it, for the same commit.
+writes `averaging-results.md` into out/benchmarks, or with `--out docs` that of the documentation. Runs that
+are done are kept in `averaging.jsonl` beside it, for the same commit.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from factorgraph_dvl.analysis.error_statistics import nees_band
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
 
-PAGE = "windows.md"
+PAGE = "averaging-results.md"
 WINDOWS_S = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)
 # Windows of the mix of errors, one of them a seed.
 MIXED_S = (0.0, 0.2, 0.5, 1.0)
@@ -54,7 +54,7 @@ MOTIONS = {
     ),
 }  # fmt: skip
 INTRODUCTION = """\
-# Windows of a DVL: measured
+# A DVL that averages: measured
 
 {origin}
 
@@ -178,7 +178,9 @@ def main() -> None:
     parser.add_argument("--only", default="", help="regular expression of motions")
     args = common.parse(parser)
     wanted = [each for each in cases(args.seeds) if re.search(args.only, each[0])]
-    runs = dict(zip(wanted, common.kept_runs(args, "windows.jsonl", wanted, outcome), strict=True))
+    runs = dict(
+        zip(wanted, common.kept_runs(args, "averaging.jsonl", wanted, outcome), strict=True)
+    )
     print(common.write_page(args.out / PAGE, page(args.origin, runs)))
 
 
