@@ -2,8 +2,8 @@
 
     python benchmarks/averaging.py [--seeds 20] [--jobs 2] [--only REGEX] [--out DIR]
 
-writes `averaging-results.md` into out/benchmarks, or with `--out docs` that of the documentation. Runs that
-are done are kept in `averaging.jsonl` beside it, for the same commit.
+writes `averaging-results.md` into out/benchmarks, or with `--out docs` that of the documentation.
+Runs that are done are kept in `averaging.jsonl` beside it, for the same commit.
 """
 
 from __future__ import annotations
