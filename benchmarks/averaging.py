@@ -73,16 +73,14 @@ The window's errors are over their σ, where it was estimated.
 
 def plan_of(motion: str, grade: str, length: float, seed: int) -> dict[str, Any]:
     """Return the scenario of a motion in the sea of a seed."""
-    plan = common.config("seed-a-phase-90")
-    if grade != "navigation":
-        mix = common.config(f"data-sheet-mix-{grade}")
-        # The clocks are one.
-        plan["imu"] = {k: v for k, v in mix["imu"].items() if not k.startswith("time_offset")}
-        plan["trial"].pop("imu")
-    if motion == "mix":
-        plan = common.config(f"data-sheet-mix-{grade}")
-    else:
+    mix = common.config(f"data-sheet-mix-{grade}")
+    plan = mix if motion == "mix" else common.config("seed-a-phase-90")
+    if motion != "mix":
         plan["manoeuvres"] = list(MOTIONS[motion])
+        if grade != "navigation":
+            # The clocks are one.
+            plan["imu"] = {k: v for k, v in mix["imu"].items() if not k.startswith("time_offset")}
+            plan["trial"].pop("imu")
     rng = np.random.default_rng([seed, 38])
     hertz = [rng.uniform(*each) for each in (SWELL_HZ, SWAY_HZ)]
     plan["sway"] = {

@@ -11,6 +11,7 @@ from factorgraph_dvl.initialization.clock_offsets import ClockOffset
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.records import GAP_INTERVALS, SensorSurvey
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.averaging import hidden_delay, stated_window
 from factorgraph_dvl.sensors.clock import ClockSection
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.dvl_beams import DvlBeams
@@ -77,8 +78,7 @@ def clock_findings(
             severity="error",
         )
     off = clock.offset - mean
-    # What a window hides of sway looks like a delay by less than half of it.
-    hidden = 0.5 * sensor.settings.velocity_window_s
+    hidden = hidden_delay(stated_window(sensor.settings))
     if abs(off) > max(_LEAST_S, _SIGMAS * clock.sigma, hidden):
         stated = sensor.settings.time_offset_s
         offset = stated + off

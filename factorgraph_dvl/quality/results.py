@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.scale_causes import scale_cause
-from factorgraph_dvl.sensors.averaging import WINDOW_KEY
+from factorgraph_dvl.sensors.averaging import is_window
 from factorgraph_dvl.sensors.protocol import Aid
 
 # Factors by which residuals are larger than stated from which on every standard deviation is too
@@ -316,15 +316,11 @@ def errors_left_out(aids: Sequence[Aid]) -> list[Finding]:
 
 def windows_left_out(aids: Sequence[Aid]) -> list[Finding]:
     """Return findings of windows that sensors state, where measurements are instantaneous."""
-    windows = [(aid, key) for aid in aids for key in aid.settings.left_out if _is_window(key)]
+    windows = [(aid, key) for aid in aids for key in aid.settings.left_out if is_window(key)]
     return [_left_out(aid, key) for aid, key in windows]
 
 
 def _left_out(aid: Aid, key: str) -> Finding:
-    key_of_text = "error_left_out.window" if _is_window(key) else "error_left_out.change"
+    key_of_text = "error_left_out.window" if is_window(key) else "error_left_out.change"
     text = message(key_of_text, section=aid.section, name=key)
     return Finding(Code.ERROR_LEFT_OUT, text, sensor=aid.label)
-
-
-def _is_window(key: str) -> bool:
-    return key.endswith(WINDOW_KEY)

@@ -10,13 +10,14 @@ import numpy as np
 from msgspec import UnsetType
 
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
+from factorgraph_dvl.sensors.protocol import SensorSection
 
 # What the stamp of a mean is the time of.
 Stamp = Literal["start", "middle", "end"]
 # Plausible length, s, of windows of instruments where nothing else is set. Chosen.
 _USUAL_S = 0.3
 # How the keys of windows end.
-WINDOW_KEY = "averaging_s"
+_WINDOW_KEY = "averaging_s"
 _MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 
 
@@ -39,6 +40,22 @@ def usual_parameter(spec: ParameterSpec, length: float, std: float | UnsetType) 
         return Parameter(spec, np.array([length]), np.zeros(1))
     final = replace(spec, usual=False, plausible=None)
     return Parameter(final, np.array([length]), np.array([std]))
+
+
+def is_window(key: str) -> bool:
+    """Whether a key, or the name of a parameter, is that of the length of a window."""
+    return key.endswith(_WINDOW_KEY)
+
+
+def stated_window(settings: SensorSection) -> float:
+    """Return the window, s, over which a section states that velocities are averaged."""
+    lengths = (getattr(settings, key) for key in settings.left_out if is_window(key))
+    return max(lengths, default=0.0)
+
+
+def hidden_delay(length: float) -> float:
+    """Return the delay, s, up to which what a window hides of sway may look like one."""
+    return 0.5 * length
 
 
 def stamp_in_the_middle(record: Any) -> None:

@@ -41,11 +41,6 @@ class ClockSection(SensorSection, frozen=True, kw_only=True):
         """What stamps of velocities are late by, and its standard deviation, s."""
         return self.time_offset_s, self.time_offset_std_s
 
-    @property
-    def velocity_window_s(self) -> float:
-        """Window over which velocities are averaged, s."""
-        return 0.0
-
 
 @dataclass(frozen=True)
 class Clock:

@@ -129,11 +129,6 @@ class DvlSettings(ClockSection, frozen=True, kw_only=True):
     current_correlation_time_s: Positive | UnsetType = UNSET
 
     @property
-    def velocity_window_s(self) -> float:
-        """Window over which velocities are averaged, s."""
-        return self.averaging_s
-
-    @property
     def left_out(self) -> tuple[str, ...]:
         """The walk of the scale, the window and the axes, where there are any."""
         keys = ("scale_walk_std_sqrt_h", "averaging_s", "axes_std_deg")

@@ -117,11 +117,6 @@ class DvlBeamsSettings(ClockSection, frozen=True, kw_only=True):
     stamp: Stamp = "middle"
 
     @property
-    def velocity_window_s(self) -> float:
-        """Window over which velocities are averaged, s."""
-        return self.averaging_s
-
-    @property
     def left_out(self) -> tuple[str, ...]:
         """The window, where there is one."""
         return ("averaging_s",) if self.averaging_s > 0.0 else ()

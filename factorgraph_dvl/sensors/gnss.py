@@ -102,11 +102,6 @@ class GnssSettings(ClockSection, frozen=True, kw_only=True):
         total = math.hypot(self.time_offset_std_s, 0.0 if isinstance(std, UnsetType) else std)
         return self.time_offset_s + self.velocity_delay_s, total
 
-    @property
-    def velocity_window_s(self) -> float:
-        """Window over which velocities are averaged, s."""
-        return self.velocity_averaging_s
-
 
 @dataclass(frozen=True)
 class Gnss:

@@ -15,7 +15,7 @@ from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
-from factorgraph_dvl.sensors.averaging import WINDOW_KEY
+from factorgraph_dvl.sensors.averaging import hidden_delay, is_window
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import Aid
 from factorgraph_dvl.solvers.known_parameters import evidence
@@ -133,9 +133,7 @@ def averaging_findings(stated: Sequence[Parameter], at: Estimated) -> tuple[Find
 def without_hidden(
     errors: Iterable[Finding], aids: Iterable[Aid], estimates: Iterable[Estimate]
 ) -> tuple[Finding, ...]:
-    """Return errors in records less those of clocks that a window explains.
-
-    What a mean hides of sway looks like a delay by less than half of the window.
+    """Return errors in records less those of clocks that a window explains: see `hidden_delay`.
 
     Parameters
     ----------
@@ -146,9 +144,9 @@ def without_hidden(
     estimates : iterable of Estimate
         What was estimated, windows among them.
     """
-    found = {e.name: float(e.value[0]) for e in estimates if e.name.endswith(WINDOW_KEY)}
+    found = {e.name: float(e.value[0]) for e in estimates if is_window(e.name)}
     lengths = {a.label: found[p.name] for a in aids for p in a.parameters() if p.name in found}
-    return tuple(f for f in errors if not _delay(f) < 0.5 * lengths.get(f.sensor, 0.0))
+    return tuple(f for f in errors if not _delay(f) < hidden_delay(lengths.get(f.sensor, 0.0)))
 
 
 def _delay(found: Finding) -> float:
