@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.problem import Problem, Rows
 from factorgraph_dvl.statistics.constancy import by_interval
 from factorgraph_dvl.statistics.rows import add_transposed_product, product, rows_with_times
@@ -152,17 +152,22 @@ def parameter_scores(
     sigma, places = np.concatenate([np.zeros(0), *wide.values()]), places_of(wide)
     of_key = {key: places[name] for name, (key, _) in columns.items()}
     score, square = np.zeros(sigma.size), np.zeros((sigma.size, sigma.size))
-    by_key: dict[int, Array] = {}
+    # By the parameters that rows see, which are some of them.
+    seen: dict[tuple[int, ...], dict[int, Array]] = {}
     for _, every in parts():
         for rows in every:
-            split = _split(rows, of_key, sigma.size)
-            if split is None:
+            J, some, rest = _split(rows, of_key)
+            if not some.size:
                 continue
-            J, rest = split
-            add_transposed_product(rest, J, by_key)
-            flat = J.reshape(-1, sigma.size)
-            score -= flat.T @ rows.vector.ravel()
-            square += flat.T @ flat
+            add_transposed_product(rest, J, seen.setdefault(tuple(some.tolist()), {}))
+            flat = J.reshape(-1, some.size)
+            score[some] -= flat.T @ rows.vector.ravel()
+            square[np.ix_(some, some)] += flat.T @ flat
+    by_key: dict[int, Array] = {}
+    for columns_seen, sums in seen.items():
+        for key, part in sums.items():
+            whole = by_key.setdefault(key, np.zeros((sigma.size, part.shape[1])))
+            whole[list(columns_seen)] += part
     if step is not None:
         score -= sum(matrix @ step.at(key) for key, matrix in by_key.items())
     known = square - information.covariance_of([by_key]) if by_key else square
@@ -171,25 +176,27 @@ def parameter_scores(
     )
 
 
-def _split(rows: Rows, of_key: Mapping[int, slice], count: int) -> tuple[Array, Rows] | None:
-    """Return the columns of parameters (M, d, C), and rows without; None where there are none."""
+def _split(rows: Rows, of_key: Mapping[int, slice]) -> tuple[Array, IntArray, Rows]:
+    """Return the columns of parameters (M, d, C), which they are (C,), and rows without them."""
     own = [of_key.get(key) for key in rows.keys[0].tolist()]
-    if not any(own):
-        return None
-    J = np.zeros((*rows.matrix.shape[:2], count))
-    edges = np.cumsum([0, *rows.sizes])
-    kept = [i for i, place in enumerate(own) if place is None]
+    edges = np.cumsum([0, *rows.sizes]).tolist()
+    parts: dict[bool, list[Array]] = {True: [], False: []}
     for place, begin, end in zip(own, edges, edges[1:], strict=False):
-        if place is not None:
-            J[:, :, place] = rows.matrix[:, :, begin:end]
-    left = [rows.matrix[:, :, edges[i] : edges[i + 1]] for i in kept]
+        parts[place is not None].append(rows.matrix[:, :, begin:end])
+    kept = [i for i, place in enumerate(own) if place is None]
+    some = [np.arange(place.start, place.stop) for place in own if place is not None]
+    nothing = np.empty((*rows.matrix.shape[:2], 0))
     rest = replace(
         rows,
         keys=rows.keys[:, kept],
         sizes=tuple(rows.sizes[i] for i in kept),
-        matrix=np.concatenate(left, axis=2),
+        matrix=np.concatenate([nothing, *parts[False]], axis=2),
     )
-    return J, rest
+    return (
+        np.concatenate([nothing, *parts[True]], axis=2),
+        np.concatenate([np.empty(0, dtype=int), *some]),
+        rest,
+    )
 
 
 def _scaled(rows: Rows, ratios: Mapping[str, Array]) -> Rows:

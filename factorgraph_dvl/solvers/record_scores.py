@@ -180,10 +180,10 @@ def squares_at(problem: Problem, bound: BoundObservation, minimum: Minimum) -> A
     if name not in minimum.kept:
         evaluation = minimum.evaluation
         each = (
-            part_of(problem, bound, some, evaluation)[0]
+            part_of(problem, bound, some, evaluation)
             for some in _in_turn(bound.observation.time.size)
         )
-        found = [by_square(problem, part, evaluation) for part in each]
+        found = [by_square(problem, *part, evaluation) for part in each]
         minimum.kept[name] = np.concatenate(found)
     return np.asarray(minimum.kept[name])
 
@@ -230,7 +230,9 @@ def part_of(
     return part, rows_of(motion, some)
 
 
-def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
+def by_square(
+    problem: Problem, bound: BoundObservation, motion: Motion, evaluation: Evaluation
+) -> Array:
     """Return derivatives (M, d, 1) of measurements by the square of the length of a window, 1/s².
 
     Of what is predicted, ρ(t), the mean over a window of length T is ρ + T²/24 d²ρ/dt².
@@ -238,14 +240,12 @@ def by_square(problem: Problem, bound: BoundObservation, evaluation: Evaluation)
     values, chain = evaluation.parameters, bound.chain
     time, shift = bound.times(values), chain.shift(values)
     covered = np.ones(time.size, dtype=bool)
-    out: Array | float = 0.0
-    for weight, apart in ((1.0, -_BETWEEN), (-2.0, 0.0), (1.0, _BETWEEN)):
-        when = time + apart
-        at = chain.attach(when, shift) if apart else bound.attachment
-        motion = bound.motion(at, evaluation.states, values)
-        predicted = bound.residual(motion, values, problem.processes_of(bound))
-        out = out + weight * predicted
+    processes = problem.processes_of(bound)
+    out = -2.0 * bound.residual(motion, values, processes)
+    for when in (time - _BETWEEN, time + _BETWEEN):
+        there = bound.motion(chain.attach(when, shift), evaluation.states, values)
+        out += bound.residual(there, values, processes)
         covered &= chain.covers(when)
-    out = np.asarray(out) / (24.0 * _BETWEEN**2)
+    out /= 24.0 * _BETWEEN**2
     out[~covered] = 0.0
     return out[:, :, None]

@@ -89,12 +89,21 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     sums : dict of int to ndarray
         Sums by key, which are changed.
     """
-    turned = factors.transpose(0, 2, 1)
+    variables: dict[bytes, list[tuple[IntArray, Array]]] = {}
     for own, matrix in _by_variable(rows):
-        first = _runs(own)
-        added = np.add.reduceat(turned @ matrix, first, axis=0)
-        for key, part in zip(own[first].tolist(), added, strict=True):
-            sums[key] = sums[key] + part if key in sums else part
+        variables.setdefault(_runs(own).tobytes(), []).append((own, matrix))
+    width = factors.shape[2]
+    for together in variables.values():
+        first = _runs(together[0][0])
+        lengths = np.diff(first, append=len(factors))
+        for length in np.unique(lengths).tolist():
+            begins = first[lengths == length]
+            items = begins[:, None] + np.arange(length)
+            turned = factors[items].reshape(begins.size, -1, width).transpose(0, 2, 1)
+            for own, matrix in together:
+                added = turned @ matrix[items].reshape(begins.size, -1, matrix.shape[2])
+                for key, part in zip(own[begins].tolist(), added, strict=True):
+                    sums[key] = sums[key] + part if key in sums else part
 
 
 def with_own_covariance(

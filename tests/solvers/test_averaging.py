@@ -239,7 +239,7 @@ def test_the_square_of_a_window_changes_what_is_predicted_as_the_window_does():
     solved, *_ = solved_problems(trial)
     problem, evaluation = solved.problem, solved.minimum.evaluation
     checked = 0
-    for bound in problem.bound:
+    for bound, motion in zip(problem.bound, evaluation.motions, strict=True):
         name = bound.observation.averaging
         if name is None:
             continue
@@ -250,7 +250,7 @@ def test_the_square_of_a_window_changes_what_is_predicted_as_the_window_does():
             there = bound.motion(bound.attached(values), evaluation.states, values)
             means.append(bound.residual(there, values, own))
         inside = slice(2, -2)
-        found = by_square(problem, bound, evaluation)[inside, :, 0]
+        found = by_square(problem, bound, motion, evaluation)[inside, :, 0]
         expected = ((means[1] - means[0]) / 0.3**2)[inside]
         # Of noise, both have a share of their own; of a mean in n, products of rates are left out.
         assert np.vdot(found, expected) == pytest.approx(np.vdot(expected, expected), rel=0.04)
