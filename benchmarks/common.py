@@ -89,6 +89,9 @@ def _given(options: dict[str, Any]) -> Iterable[str]:
             yield flag
         elif isinstance(value, list):
             yield from (f"{flag} {each}" for each in value)
+        elif isinstance(value, Path):
+            # Where a program lies on this machine is no part of a page.
+            yield f"{flag} {value.name}"
         elif value not in (None, False, ""):
             yield f"{flag} {value}"
 

@@ -1,12 +1,14 @@
 """Measure speed, memory and integration error.
 
-    python benchmarks/run.py [--long] [--out DIR]
+    python benchmarks/run.py [--long] [--kf-gins PATH] [--against COMMIT] [--out DIR]
 
 writes `results.md` into out/benchmarks, or with `--out benchmarks` that of the repository.
 
 Figures that are compared with each other are measured in the same run, alternating, so
 that a busy machine does not favour either. `--long` adds a trial eight times as long, and
 one of a day in Parquet, which take a quarter of an hour and two gigabytes of disk.
+`--kf-gins` is the program of that name, and `--against` a commit of this repository: both run in
+turn with the cruise.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import date
@@ -32,6 +34,7 @@ from typing import Any
 
 import common
 import gtsam
+import kf_gins
 import numpy as np
 import yaml
 from common import ROOT
@@ -81,12 +84,15 @@ class Run:
 def main() -> None:
     parser = common.parser(__doc__)
     parser.add_argument("--long", action="store_true", help="add trials 8 and 18 times as long")
+    parser.add_argument("--kf-gins", type=Path, help="program that runs in turn with the cruise")
+    parser.add_argument("--against", help="commit that runs in turn with the cruise")
     args = common.parse(parser)
     load = os.getloadavg()[0]
     lines: list[str] = []
     for title, rows in (
         ("Command line", command_line()),
         (f"Calibration cruise of {cruise_duration():.0f} s", cruise(long=args.long)),
+        ("In turn with others", others(args.kf_gins, args.against)),
         ("Coning and sculling", coning()),
     ):
         print(f"\n{title}", flush=True)
@@ -212,6 +218,84 @@ def cruise(*, long: bool) -> Iterator[tuple[str, str, str]]:
         if long:
             yield from times_as_long(folder, once, TIMES_AS_LONG, ("9", ""))
             yield from times_as_long(folder, once, TIMES_A_DAY, ("19", "5 GB"), "--parquet")
+
+
+def others(program: Path | None, commit: str | None) -> Iterator[tuple[str, str, str]]:
+    """Run trials in turn with KF-GINS and with another commit: CPU and wall time, better of 2."""
+    if program is None:
+        yield "KF-GINS", "not measured (`--kf-gins`)", ""
+    if commit is None:
+        yield "an earlier commit", "not measured (`--against`)", ""
+    with temporary_folder() as folder, checked_out(commit, folder / "against") as source:
+        config = yaml.safe_load(CRUISE.read_text(encoding="utf-8"))
+        config["trial"] = {"imu": config["trial"]["imu"]}
+        everything = folder / "everything.yaml"
+        everything.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
+        cruise, estimated = folder / "cruise", folder / "everything"
+        run_cli("simulate", CRUISE, "--out", cruise, "--seed", 1)
+        run_cli("simulate", everything, "--out", estimated, "--seed", 1)
+        for number, (what, trial, more) in enumerate(
+            (
+                ("cruise, files to files with figures", cruise, ()),
+                ("cruise, `--no-figures`", cruise, ("--no-figures",)),
+                ("cruise with clocks, antenna and DVL bias estimated", estimated, ()),
+                ("shipped trial, files to files with figures", SHIPPED, ()),
+            )
+        ):
+            runs: dict[str, Callable[[Path], Run]] = {"": partial(solved, trial, more, None)}
+            if source is not None:
+                runs[f"commit {commit}"] = partial(solved, trial, more, source)
+            if program is not None and trial == cruise:
+                runs["KF-GINS"] = partial(filtered, program, trial)
+            yield from ratios(what, in_turn(runs, folder / f"{number}"))
+
+
+def ratios(what: str, best: Mapping[str, Run]) -> Iterator[tuple[str, str, str]]:
+    """Yield the rows of programs that ran in turn; the first one has no name."""
+    own = best[""]
+    for name, run in best.items():
+        label = what if run is own else f"– {name}"
+        memory = f"{run.peak / 1e9:.2f} GB"
+        yield label, f"CPU {run.cpu:.1f} s, wall {run.wall:.1f} s, {memory}", ""
+        if run is not own:
+            compared = f"CPU {own.cpu / run.cpu:.2f}, wall {own.wall / run.wall:.2f}"
+            yield f"**– ratio to {name}**", compared, ""
+
+
+def in_turn(runs: Mapping[str, Callable[[Path], Run]], folder: Path) -> dict[str, Run]:
+    """Return the better of two runs of each program, by CPU time."""
+    taken: dict[str, list[Run]] = {name: [] for name in runs}
+    for turn in range(2):
+        for number, (name, run) in enumerate(runs.items()):
+            taken[name].append(run(folder / f"{number}-{turn}"))
+    return {name: min(times, key=lambda run: run.cpu) for name, times in taken.items()}
+
+
+def solved(trial: Path, more: tuple[str, ...], source: Path | None, out: Path) -> Run:
+    """Solve a trial with this package, or with that of another folder."""
+    out.parent.mkdir(exist_ok=True)
+    arguments = ("solve", f"{trial}", "--out", f"{out}", *more)
+    return run_python("-m", "factorgraph_dvl.cli", *arguments, source=source)[0]
+
+
+def filtered(program: Path, trial: Path, out: Path) -> Run:
+    """Run KF-GINS over a trial."""
+    kf_gins.write_inputs(load_trial(trial), out)
+    return run_program([f"{program.resolve()}", kf_gins.CONFIGURATION], cwd=out)[0]
+
+
+@contextmanager
+def checked_out(commit: str | None, folder: Path) -> Iterator[Path | None]:
+    """Yield a folder with another commit of this repository, None without one."""
+    if commit is None:
+        yield None
+        return
+    git = ["git", "-C", f"{ROOT}", "worktree"]
+    subprocess.run([*git, "add", "--quiet", "--detach", f"{folder}", commit], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run([*git, "remove", "--force", f"{folder}"], check=True)
 
 
 def iteration_times(trial: Trial) -> Iterator[tuple[str, str, str]]:
@@ -377,12 +461,17 @@ def run_cli(*args: object) -> Run:
     return replace(run, stages=stages_of(log, run.wall))
 
 
-def run_python(*args: str) -> tuple[Run, str]:
-    """Run Python in a process of its own; return what it took and what it printed."""
-    command = [sys.executable, *args]
+def run_python(*args: str, source: Path | None = None) -> tuple[Run, str]:
+    """Run Python, with the package of another folder if one is given, as `run_program`."""
+    environment = None if source is None else os.environ | {"PYTHONPATH": f"{source}"}
+    return run_program([sys.executable, *args], env=environment, cwd=source)
+
+
+def run_program(command: list[str], **how: Any) -> tuple[Run, str]:
+    """Run a program in a process of its own; return what it took and what it printed."""
     with tempfile.TemporaryFile("w+") as log:
         start = perf_counter()
-        process = subprocess.Popen(command, stdout=log, stderr=log)
+        process = subprocess.Popen(command, stdout=log, stderr=log, **how)
         # Of this child alone: getrusage knows only the largest of all children.
         _, status, usage = os.wait4(process.pid, 0)
         wall = perf_counter() - start

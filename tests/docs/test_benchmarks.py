@@ -14,7 +14,7 @@ from factorgraph_dvl.simulation import parse_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 # Modules that scripts share are none.
-SHARED = ("common", "fault_rows")
+SHARED = ("common", "fault_rows", "kf_gins")
 SCRIPTS = sorted(p.stem for p in (ROOT / "benchmarks").glob("*.py") if p.stem not in SHARED)
 # Where a page of the repository is, of those with a sample that is made anew below.
 SAMPLED = (
