@@ -46,9 +46,9 @@ _FAR = 4.0
 _OUTSIDE = 5.0
 # Cost up to which a cause is as probable as the most probable one. Chosen: a likelihood of e^-4.
 _TIE = 4.0
-# Segments whose rows are there at a time. Chosen: those of an hour and a half; where many
-# parameters are free, they take 0.1 GB.
-_LONGEST = 5_000
+# Segments whose rows are there at a time. Chosen: those of a quarter of an hour; where many
+# parameters are free, they take 20 MB.
+_LONGEST = 1_000
 # Least scale of residuals against what is stated. Chosen: records without noise have none.
 _LEAST_SCALE = 0.5
 # Share of the squares of a scale of the gyros that the wrong `sampling` may leave. Chosen: the

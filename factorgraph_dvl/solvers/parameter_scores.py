@@ -165,9 +165,12 @@ def parameter_scores(
             square[np.ix_(some, some)] += flat.T @ flat
     by_key: dict[int, Array] = {}
     for columns_seen, sums in seen.items():
-        for key, part in sums.items():
-            whole = by_key.setdefault(key, np.zeros((sigma.size, part.shape[1])))
-            whole[list(columns_seen)] += part
+        rows_of_sum = list(columns_seen)
+        while sums:
+            key, part = sums.popitem()
+            if key not in by_key:
+                by_key[key] = np.zeros((sigma.size, part.shape[1]))
+            by_key[key][rows_of_sum] += part
     if step is not None:
         score -= sum(matrix @ step.at(key) for key, matrix in by_key.items())
     known = square - information.covariance_of([by_key]) if by_key else square
