@@ -19,6 +19,7 @@ from factorgraph_dvl.sensors.dvl import Dvl, DvlSettings
 from factorgraph_dvl.sensors.gnss import Gnss, GnssSettings
 from factorgraph_dvl.sensors.imu import Imu, ImuSettings
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.trial import (
     InitialAttitude,
     InitialPosition,
@@ -186,3 +187,10 @@ def edit(file: Path, old: str, new: str) -> int:
     assert old in text, f"{old!r} is not in {file}"
     file.write_text(text.replace(old, new, 1))
     return text[: text.index(old)].count("\n") + 1
+
+
+def build_history(solution: Solution) -> InformationHistory:
+    """Return what its information is along the trial: from the first to the last the same."""
+    root = np.diag(np.sqrt(np.diag(solution.covariance)))
+    time = solution.trajectory.time[[0, -1]]
+    return InformationHistory(time, tuple(solution.order), np.stack([root, root]))

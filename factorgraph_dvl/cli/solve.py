@@ -38,12 +38,13 @@ from factorgraph_dvl.cli.report import write_report
 from factorgraph_dvl.cli.verdict import end_with, print_conclusion, print_notes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from factorgraph_dvl.analysis.comparison.halves import Halves
     from factorgraph_dvl.analysis.dead_reckoning.check import Check
     from factorgraph_dvl.baselines import History
     from factorgraph_dvl.baselines.calibration import Method
+    from factorgraph_dvl.geometry.vectors import Array
     from factorgraph_dvl.solution import Solution
     from factorgraph_dvl.statistics.information_history import InformationHistory
     from factorgraph_dvl.trial import Trial
@@ -125,11 +126,8 @@ def solve(
         solution, along = solve_with_history(
             trial, rate_hz=rate, entries=_ENTRIES, anyway=anyway, progress=progress
         )
-        found = _Found(solution, along=along)
-        first: Solution | None = None
-        if parts is not None:
-            found, first = _with_halves(trial, found, parts, progress)
-        return replace(found, check=_checked(trial, solution, first, progress))
+        found = _Found(solution, along=along, check=_checked(trial, solution, along.halfway))
+        return found if parts is None else _with_halves(trial, found, parts, progress)
 
     _solve_into(
         out,
@@ -200,8 +198,8 @@ def kalman(
 
 def _with_halves(
     trial: Trial, found: _Found, parts: tuple[Trial, Trial], progress: ProgressLine
-) -> tuple[_Found, Solution | None]:
-    """Return a solution with the difference of the halves, and the first half's own."""
+) -> _Found:
+    """Return a solution with the difference of the halves."""
     from factorgraph_dvl.analysis.comparison.halves import compare_halves
     from factorgraph_dvl.errors import FactorgraphDvlError
     from factorgraph_dvl.message import message
@@ -213,42 +211,34 @@ def _with_halves(
     except FactorgraphDvlError as error:
         text = message("halves_differ.unsolved", error=str(error))
         note = Finding(Code.HALVES_DIFFER, text, severity="note")
-        return replace(found, solution=found.solution.with_findings((note,))), None
+        return replace(found, solution=found.solution.with_findings((note,)))
     halves = compare_halves(trial, first, second)
     solution = found.solution.with_findings(halves.findings())
-    return replace(found, solution=solution, halves=halves), first
+    return replace(found, solution=solution, halves=halves)
 
 
-def _checked(
-    trial: Trial, solution: Solution, first: Solution | None, progress: ProgressLine
-) -> Check | None:
+def _checked(trial: Trial, solution: Solution, halfway: Mapping[str, Array]) -> Check | None:
     """Return what the calibration does to the DVL's residuals and to dead reckoning.
 
-    The calibration of the first half is used with the data of the second. Where the first half
-    gives none to be used, or the trial itself, the data are those that the calibration is from.
+    The calibration by the data of the first half is used with the data of the second. Where the
+    trial gives none to be used, the data are those that the calibration is from.
     """
     from factorgraph_dvl.analysis.comparison.halves import halves_of
     from factorgraph_dvl.analysis.dead_reckoning.check import Data, check_calibration
     from factorgraph_dvl.errors import FactorgraphDvlError
     from factorgraph_dvl.estimates import values_of
-    from factorgraph_dvl.solvers.batch import solve as run_batch
 
     if trial.log is None or trial.position_sensor is None:
         return None
-
-    def half(stage: str, iteration: int, cost: float | None) -> None:
-        progress(f"first half: {stage}", iteration, cost)
-
-    candidates: list[tuple[Trial, Solution, Data]] = [(trial, solution, "same data")]
-    with suppress(FactorgraphDvlError):
-        start, rest = halves_of(trial)
-        if solution.verdict.grade != "do not use":
-            first = first or run_batch(start, anyway=True, progress=half)
-        if first is not None and first.verdict.grade != "do not use":
-            candidates.insert(0, (rest, first, "second half"))
-    for part, found, data in candidates:
+    candidates: list[tuple[Trial, Mapping[str, Array], Data]] = [
+        (trial, values_of(solution.estimates), "same data")
+    ]
+    if halfway and solution.verdict.grade != "do not use":
         with suppress(FactorgraphDvlError):
-            return check_calibration(part, solution, values_of(found.estimates), data)
+            candidates.insert(0, (halves_of(trial)[1], halfway, "second half"))
+    for part, values, data in candidates:
+        with suppress(FactorgraphDvlError):
+            return check_calibration(part, solution, values, data)
     return None
 
 

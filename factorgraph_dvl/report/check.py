@@ -12,8 +12,9 @@ TITLE = "Before and after calibration"
 SOURCES = {
     "second half": "The calibration is that of the first half of the trial, tested with the data "
     "of the second half.",
-    "same data": "The first half alone gives no calibration to use. So the calibration is tested "
-    "with the data that it was estimated from, which makes errors look smaller.",
+    "same data": "The trial gives no calibration to use, or its second half has too few data. So "
+    "the calibration is tested with the data that it was estimated from, which makes errors look "
+    "smaller.",
 }
 POSITIONS = {
     "reference": "Positions are compared with the reference.",

@@ -8,19 +8,22 @@ state with all constants behind it:
 x_k is eliminated first, so that the triangle that is left over c is the square root of the
 information of all data so far on the constants, whatever the states were: their
 marginal information. Nothing is squared (Bierman, Factorization Methods for Discrete
-Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has.
+Sequential Estimation, 1977, ch. VI). At the end it is what the smoother has. Residuals are one
+more column, which gives the constants by the data so far.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import gtsam
 import numpy as np
 from scipy.linalg.lapack import dgeqrf, dtrtri
 
+from factorgraph_dvl.estimates import values_of
+from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array, IntArray, sums_before
 from factorgraph_dvl.graph.problem import FIXED_DIRECTION_STD, Evaluation, Problem
 from factorgraph_dvl.solution import Progress, Solution
@@ -28,6 +31,7 @@ from factorgraph_dvl.solvers.batch import solve_with_problem
 from factorgraph_dvl.solvers.calibration import changes_of, prior_along, reported
 from factorgraph_dvl.solvers.considered_errors import ConsideredError
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
+from factorgraph_dvl.solvers.reported import estimates_of
 from factorgraph_dvl.statistics.information_history import InformationHistory
 from factorgraph_dvl.statistics.spurious_information import spurious_information
 from factorgraph_dvl.statistics.undetermined_directions import (
@@ -36,6 +40,25 @@ from factorgraph_dvl.statistics.undetermined_directions import (
     undetermined_directions,
 )
 from factorgraph_dvl.trial import Trial
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """What a filter along a chain says of the constants at nodes, and its frontier at the end.
+
+    Parameters
+    ----------
+    triangles : ndarray, shape (K, c, c)
+        Square-root information on the constants, before any data for the first node of all.
+    right_sides : ndarray, shape (K, c)
+        Triangle times the step of the constants to their values by the data up to a node.
+    frontier : Frontier
+        Information at the last node.
+    """
+
+    triangles: Array
+    right_sides: Array
+    frontier: Frontier
 
 
 @dataclass(frozen=True)
@@ -91,14 +114,58 @@ def information_history(found: SolvedProblem, *, entries: int | None = None) -> 
         first and the last. By default every node has one.
     """
     problem, evaluation = found.problem, found.minimum.evaluation
-    count = problem.chain.node_time.size
-    shown = np.unique(np.linspace(0, count - 1, min(entries or count, count)).astype(int))
-    triangles, _ = run_filter(problem, evaluation, nodes=shown)
-    undetermined = _undetermined(found, triangles, shown)
+    time = problem.chain.node_time
+    shown = np.linspace(0, time.size - 1, min(entries or time.size, time.size)).astype(int)
+    middle = int(np.searchsorted(time, 0.5 * (time[0] + time[-1]), side="right")) - 1
+    shown = np.union1d(shown, [middle])
+    filtered = run_filter(problem, evaluation, nodes=shown)
+    undetermined = _undetermined(found, filtered.triangles, shown)
     errors = found.covariances.errors
-    return as_history(
-        problem, evaluation, found.fixed, triangles, undetermined, nodes=shown, errors=errors
+    history = as_history(
+        problem,
+        evaluation,
+        found.fixed,
+        filtered.triangles,
+        undetermined,
+        nodes=shown,
+        errors=errors,
     )
+    at = int(np.searchsorted(shown, middle))
+    triangle, right = filtered.triangles[at], filtered.right_sides[at]
+    values = _values_at(problem, evaluation, triangle, right, undetermined.get(at))
+    return replace(history, halfway=values)
+
+
+def _values_at(
+    problem: Problem,
+    evaluation: Evaluation,
+    triangle: Array,
+    right: Array,
+    undetermined: Array | None,
+) -> dict[str, Array]:
+    """Return the calibration by the data up to a node, by name in reported units.
+
+    One linear step from the whole trial, with its noise and without its outliers. Directions
+    (P, h) that are not determined yet stay at their prior.
+    """
+    if undetermined is not None:
+        gain = undetermined.T @ np.linalg.inv(problem.prior_root) / FIXED_DIRECTION_STD
+        beside = np.zeros((len(gain), len(right) - gain.shape[1]))
+        from_prior = problem.difference(evaluation.parameters, problem.prior_values())
+        rows = np.hstack([beside, gain, -(gain @ from_prior)[:, None]])
+        rows = np.vstack([np.hstack([triangle, right[:, None]]), rows])
+        triangle, right = np.hsplit(_triangle(rows, len(right)), [len(right)])
+    step = np.linalg.solve(triangle, right.ravel())
+    columns = _constants(problem)
+    moved = dict(evaluation.parameters)
+    for p in problem.parameters:
+        at = columns[problem.key(p.name)]
+        own = step[at : at + p.mean.size]
+        moved[p.name] = moved[p.name] @ exp_so3(own) if p.rotation else moved[p.name] + own
+    there = replace(evaluation, parameters=moved)
+    rows_of = [(p, value) for p, value, _ in reported(problem, there) if p.name in moved]
+    free = sum(p.mean.size for p, _ in rows_of if p.estimated)
+    return values_of(estimates_of(rows_of, np.zeros((free, free)))[0])
 
 
 def _undetermined(found: SolvedProblem, triangles: Array, shown: Array) -> dict[int, Array]:
@@ -126,7 +193,7 @@ def run_filter(
     start: Frontier | None = None,
     *,
     nodes: IntArray | None = None,
-) -> tuple[Array, Frontier]:
+) -> Filtered:
     """Return the triangles over the constants before any data and at each later node.
 
     Parameters
@@ -138,13 +205,6 @@ def run_filter(
         are left out: it contains them.
     nodes : ndarray of int, optional
         Those whose triangles are returned, in order; by default all.
-
-    Returns
-    -------
-    triangles : ndarray, shape (K, c, c)
-        Square-root information on the constants, before any data for the first node of all.
-    frontier : Frontier
-        Information at the last node.
     """
     steps = _rows_by_step(problem, evaluation, with_priors=start is None)
     # Nothing else holds the factors then, so that each goes with its step.
@@ -158,9 +218,10 @@ def run_filter(
     c = sum(sizes[key] for key in columns)
     wanted = np.arange(last + 1) if nodes is None else nodes
     place = {k: i for i, k in enumerate(wanted.tolist())}
-    out = np.empty((wanted.size, c, c))
+    out = np.empty((wanted.size, c, c + 1))
     frontier = [] if start is None else _own_keys(problem, 0)
-    root = np.zeros((0, c)) if start is None else start.root
+    # The last column is the right side.
+    root = np.zeros((0, c + 1)) if start is None else np.pad(start.root, ((0, 0), (0, 1)))
     for k in range(-1 if start is None else 0, last + 1):
         # Factors that nobody else holds go with their step.
         rows = steps.pop(k, [])
@@ -177,8 +238,8 @@ def run_filter(
         # Measurements at the very last node, if any, belong to its time.
         if (at := place.get(min(k + 1, last))) is not None:
             out[at] = triangle[len(triangle) - c :, len(triangle) - c :]
-    ending = c + sum(sizes[key] for key in _own_keys(problem, last))
-    return out, Frontier(root[len(root) - ending :, len(root) - ending :])
+    ending = len(root) - c - sum(sizes[key] for key in _own_keys(problem, last))
+    return Filtered(out[:, :, :-1], out[:, :, -1], Frontier(root[ending:, ending:-1]))
 
 
 def _own_keys(problem: Problem, k: int) -> list[int]:
@@ -288,8 +349,12 @@ class _Factor:
 
     @property
     def matrix(self) -> Array:
-        """Whitened rows; those of all factors at once would take as much memory as all else."""
-        return np.asarray(self.factor.jacobian()[0])
+        """Whitened rows; those of all factors at once would take as much memory as all else.
+
+        The last column is the right side.
+        """
+        matrix, right = self.factor.jacobian()
+        return np.column_stack([matrix, right])
 
 
 def _rows_by_step(
@@ -342,7 +407,7 @@ def _stacked(
     constants: Mapping[int, int],
     sizes: Mapping[int, int],
 ) -> tuple[Array, int]:
-    """Return rows over variables in an order, then constants, and their number of columns."""
+    """Return rows over variables in an order, constants, and right side; number of variables."""
     column: dict[int, int] = {}
     width = 0
     for key in order:
@@ -351,7 +416,7 @@ def _stacked(
     column |= {key: width + at for key, at in constants.items()}
     width += sum(sizes[key] for key in constants)
     blocks = [([*frontier, *constants], root), *((f.keys, f.matrix) for f in factors)]
-    out = np.zeros((sum(len(matrix) for _, matrix in blocks), width))
+    out = np.zeros((sum(len(matrix) for _, matrix in blocks), width + 1))
     row = 0
     for involved, matrix in blocks:
         at = 0
@@ -361,18 +426,23 @@ def _stacked(
                 :, at : at + size
             ]
             at += size
+        out[row : row + len(matrix), width] = matrix[:, at]
         row += len(matrix)
     return out, width
 
 
 def _triangle(rows: Array, size: int) -> Array:
-    """Return the upper triangle (size, size) of a QR factorisation, with a positive diagonal."""
+    """Return the upper triangle of a QR factorisation, with a positive diagonal.
+
+    Of the first columns, (size, size); those that follow are reflected with them.
+    """
     if rows.shape[0] < size:
-        rows = np.concatenate([rows, np.zeros((size - rows.shape[0], size))])
+        rows = np.concatenate([rows, np.zeros((size - rows.shape[0], rows.shape[1]))])
     # Rows of large weight first: Householder's reflections then lose no digits of the others.
-    heavy = np.argsort(-np.abs(rows).max(axis=1), kind="stable")
+    heavy = np.argsort(-np.abs(rows[:, :size]).max(axis=1), kind="stable")
     R = dgeqrf(rows[heavy])[0][:size]
-    return R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None] * _upper(size)
+    R[:, :size] *= _upper(size)
+    return R * np.where(np.diag(R) < 0.0, -1.0, 1.0)[:, None]
 
 
 @lru_cache(maxsize=16)

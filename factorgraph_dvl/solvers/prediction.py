@@ -97,7 +97,7 @@ def predict_posterior(
         Information at the last node, to go on from.
     """
     problem, evaluation = _at_truth(trial, true_states, white or {})
-    triangles, frontier = run_filter(problem, evaluation)
+    filtered = run_filter(problem, evaluation)
 
     def linearised_at(values: gtsam.Values) -> Minimum:
         return _minimum(problem, problem.evaluate(values))
@@ -107,9 +107,10 @@ def predict_posterior(
     )
     evaluation = found.minimum.evaluation
     if found.fixed.size:
-        triangles, _ = run_filter(problem, evaluation)
-    history = as_history(problem, evaluation, found.fixed, triangles, {})
-    return summarise(trial, found, rate_hz=RATE_HZ), history, frontier
+        again = run_filter(problem, evaluation)
+        filtered = replace(again, frontier=filtered.frontier)
+    history = as_history(problem, evaluation, found.fixed, filtered.triangles, {})
+    return summarise(trial, found, rate_hz=RATE_HZ), history, filtered.frontier
 
 
 def continue_posterior(
@@ -125,9 +126,10 @@ def continue_posterior(
         Frontier at the first node.
     """
     problem, evaluation = _at_truth(trial, true_states, {})
-    triangles, frontier = run_filter(problem, evaluation, start)
+    found = run_filter(problem, evaluation, start)
     none_fixed = np.zeros((len(problem.prior_root), 0))
-    return as_history(problem, evaluation, none_fixed, triangles[-1:], {}), frontier
+    history = as_history(problem, evaluation, none_fixed, found.triangles[-1:], {})
+    return history, found.frontier
 
 
 def _at_truth(

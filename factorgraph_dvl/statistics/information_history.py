@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,11 +25,14 @@ class InformationHistory:
         Square roots S of the covariances S Sᵀ, in reported units. Kept as roots because a product
         of priors of hundreds of degrees and posteriors of arc seconds leaves a matrix of
         information few digits.
+    halfway : mapping of str to ndarray, optional
+        Calibration by the data of the first half, by name in reported units.
     """
 
     time: Array
     names: tuple[str, ...]
     root: Array
+    halfway: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def std(self) -> Array:

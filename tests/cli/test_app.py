@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import build_solution, build_trial, edit, write_trial
+from builders import build_history, build_solution, build_trial, edit, write_trial
 from running import Run
 from truth import CONFIGS
 
@@ -38,14 +38,14 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         entries: int,
         anyway: bool,
         progress: Callable[..., None],
-    ) -> tuple[Solution, InformationHistory | None]:
+    ) -> tuple[Solution, InformationHistory]:
         state["trial"], state["rate"] = trial, rate_hz
         progress("alignment", 0, None)
         progress("batch", 0, 9.87e12)
         progress("batch", 1, 12.51234)
         if state["raises"] is not None:
             raise state["raises"]
-        return state["solution"], state.get("along")
+        return state["solution"], state.get("along") or build_history(state["solution"])
 
     def write_figures(trial: Trial, solution: Solution, folder: Path, *, kind: str) -> None:
         folder.mkdir()
@@ -105,7 +105,7 @@ def test_solve_options(tmp_path: Path, run: Run, stub: dict[str, Any]) -> None:
     assert stub["rate"] == 2.5
     assert "iteration" not in result.err
     assert {p.name for p in out.iterdir()} == {
-        *("calibration.json", "trajectory.csv", "report.html", "run.json")
+        *("calibration.json", "history.csv", "trajectory.csv", "report.html", "run.json")
     }
     assert run("solve", trial, "--out", out).code == 2
     assert run("solve", trial, "--out", out, "--force").code == 0

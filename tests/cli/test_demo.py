@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from builders import build_solution, build_trial
+from builders import build_history, build_solution, build_trial
 from running import Run
 
 from factorgraph_dvl.cli.commands import COMMANDS, command
@@ -42,7 +42,7 @@ def test_the_demo_is_the_shipped_trial_and_opens_its_page(
     solution = build_solution()
 
     def solve(*_: Any, **__: Any) -> Any:
-        return solution, None
+        return solution, build_history(solution)
 
     monkeypatch.setattr(
         "factorgraph_dvl.solvers.information_along_trial.solve_with_history", solve

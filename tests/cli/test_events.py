@@ -10,7 +10,7 @@ from typing import Any, get_args
 import events_schema
 import msgspec
 import pytest
-from builders import build_solution, write_trial
+from builders import build_history, build_solution, write_trial
 from calibrations import calibration
 from running import Run
 
@@ -54,7 +54,7 @@ def test_a_result_comes_with_its_verdict_and_its_files(
     solution = build_solution()
     monkeypatch.setattr(
         "factorgraph_dvl.solvers.information_along_trial.solve_with_history",
-        lambda *_, **__: (solution, None),
+        lambda *_, **__: (solution, build_history(solution)),
     )
     out = tmp_path / "out"
     result = run("--json", "solve", write_trial(tmp_path), "--out", out, "--no-figures")

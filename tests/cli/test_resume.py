@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from builders import build_solution, write_trial
+from builders import build_history, build_solution, write_trial
 
 
 def test_resume_says_that_it_does_nothing_and_what_was_kept_goes(run, monkeypatch, tmp_path):
@@ -10,7 +10,7 @@ def test_resume_says_that_it_does_nothing_and_what_was_kept_goes(run, monkeypatc
 
     def solve(trial, **options):
         asked.append(options.keys())
-        return build_solution(), None
+        return (solution := build_solution()), build_history(solution)
 
     module = "factorgraph_dvl.solvers.information_along_trial"
     monkeypatch.setattr(f"{module}.solve_with_history", solve)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import build_solution, edit, write_trial
+from builders import build_history, build_solution, edit, write_trial
 from truth import CONFIGS
 
 import factorgraph_dvl.solvers.information_along_trial
@@ -334,7 +334,7 @@ def test_a_second_run_into_one_output_fails_at_once(tmp_path, capsys, monkeypatc
                 check=False,
             )
         )
-        return build_solution(), None
+        return (solution := build_solution()), build_history(solution)
 
     module = factorgraph_dvl.solvers.information_along_trial
     monkeypatch.setattr(module, "solve_with_history", solve)

@@ -85,6 +85,7 @@ def test_a_window_that_is_not_stated_is_found():
     assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
 def test_noise_of_gyros_hides_no_window(grade):
     """Their noise was most of the curvature by which a window shows, and hid half a second."""
@@ -100,6 +101,7 @@ def test_noise_of_gyros_hides_no_window(grade):
     assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
 
 
+@pytest.mark.slow
 def test_a_long_window_is_no_contradiction():
     found = solve(trial_of(2.0, 1))
     assert found.estimate("averaging_s").value[0] == pytest.approx(2.0, abs=0.02)

@@ -10,6 +10,7 @@ import pytest
 from problems import SHORT, dense_covariance, problem_of, walking
 from truth import config, scenario
 
+from factorgraph_dvl.analysis.comparison.halves import halves_of
 from factorgraph_dvl.analysis.information.manoeuvres import Segment
 from factorgraph_dvl.analysis.information.observability import information_shares
 from factorgraph_dvl.geometry.rotations import exp_so3, log_so3
@@ -18,7 +19,7 @@ from factorgraph_dvl.graph import keys
 from factorgraph_dvl.graph.priors import Tilt
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.simulation import simulate
-from factorgraph_dvl.solvers.batch import solved_problems
+from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.information_along_trial import (
     as_history,
     information_history,
@@ -73,7 +74,8 @@ def system(scene):
 def test_every_entry_equals_dense_algebra(walks):
     scene = walking() if walks else scenario(manoeuvres=SHORT)
     problem, evaluation, place, A, first = system(scene)
-    triangles, frontier = run_filter(problem, evaluation)
+    found = run_filter(problem, evaluation)
+    triangles, frontier = found.triangles, found.frontier
     constants = [] if walks else [keys.bias(0)]
     constants += [problem.key(p.name) for p in problem.parameters]
     columns = np.concatenate([np.arange(place[k].start, place[k].stop) for k in constants])
@@ -109,6 +111,34 @@ def test_the_last_entry_is_the_solution(name):
     prior = np.concatenate([e.prior_std for e in solution.estimates])[index]
     np.testing.assert_allclose(history.std[0][3:], prior[3:], rtol=1e-6)
     assert history.time[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_halfway_it_is_what_the_first_half_says():
+    """A step from the whole trial, against a solution of the first half alone."""
+    turns = [
+        each
+        for rate in (6, -6, 6, -6)
+        for each in ({"straight_s": 25}, {"turn_deg_s": rate, "duration_s": 25})
+    ]
+    trial = simulate(scenario(noise=True, manoeuvres=turns), 3)
+    whole, history = solve_with_history(trial)
+    first = solve(halves_of(trial)[0], anyway=True)
+    moved = []
+    for name in ("misalignment_deg", "scale_error", "lever_arm_m"):
+        own = first.estimate(name)
+        assert np.all(np.abs(history.halfway[name] - own.value) < 0.3 * own.std), name
+        moved += [*(np.abs(whole.estimate(name).value - own.value) / own.std)]
+    assert max(moved) > 1.0
+
+
+def test_halfway_directions_that_are_not_determined_yet_stay_at_their_prior():
+    """Sailing straight on, nothing shows the lever arm along the course."""
+    late = [{"straight_s": 60}, {"turn_deg_s": 6, "duration_s": 30}, {"straight_s": 20}]
+    trial = simulate(scenario(noise=True, manoeuvres=late, **CALM), 1)
+    whole, history = solve_with_history(trial)
+    stated = trial.dvl.settings.lever_arm_m[0]
+    assert history.halfway["lever_arm_m"][0] == pytest.approx(stated, abs=1e-3)
+    assert abs(whole.estimate("lever_arm_m").value[0] - stated) > 0.1
 
 
 def test_information_only_grows():
@@ -232,7 +262,8 @@ def without_imu(request):
 
 def test_without_imu_it_ends_with_the_information_of_the_whole(without_imu):
     problem, evaluation = without_imu
-    triangles, frontier = run_filter(problem, evaluation)
+    found = run_filter(problem, evaluation)
+    triangles, frontier = found.triangles, found.frontier
     information, _ = factorized(problem, evaluation)
     every = {
         problem.key(name): np.eye(len(problem.prior_root))[:, own]
@@ -248,7 +279,7 @@ def test_without_imu_it_ends_with_the_information_of_the_whole(without_imu):
 
 def test_without_imu_it_begins_with_the_priors_and_grows(without_imu):
     problem, evaluation = without_imu
-    triangles, _ = run_filter(problem, evaluation)
+    triangles = run_filter(problem, evaluation).triangles
     fixed = np.zeros((len(problem.prior_root), 0))
     history = as_history(problem, evaluation, fixed, triangles, {})
     np.testing.assert_allclose(history.time, problem.chain.node_time)
