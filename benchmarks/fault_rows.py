@@ -308,7 +308,11 @@ ROWS = (
         "1/√h",
         (0.003, 0.03),
         lambda x: [f.dvl_scale_walk(x)],
-        (gross("DVL"), r"^(changed_along_trial|halves_differ)[^:]*scale"),
+        (
+            gross("DVL"),
+            r"^(changed_along_trial|halves_differ)[^:]*scale",
+            r"^estimated_instead DVL velocity scale_error",
+        ),
     ),
     Row(
         "DVL: scale drifts",

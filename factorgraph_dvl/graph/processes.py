@@ -54,7 +54,8 @@ class Process:
     parameter : str, optional
         Name of the parameter that it adds to, for all observations that depend on it.
     free : bool, default False
-        Whether its deviation and time are to be estimated although it is of no observation.
+        Whether its deviation and time are to be estimated although it is of no observation, or
+        the rate of its walk.
     goes_on : bool, default False
         Whether nodes before it are gone, so that its first node has no prior of its own.
     """
@@ -121,7 +122,7 @@ class Process:
     def nodes_of(self, values: Mapping[str, Array]) -> Array:
         """Return its nodes (J, size) among values by name: without an error if it had others."""
         nodes = values.get(self.name, self.zero)
-        return nodes if len(nodes) == self.time.size else self.zero
+        return nodes if nodes.shape == self.zero.shape else self.zero
 
     def place(self, time: Array) -> tuple[IntArray, Array]:
         """Return the nodes before times (M,), and the weights of the nodes after them."""

@@ -292,7 +292,7 @@ class Past:
             end, step = process.time[-1], float(process.time[-1] - process.time[-2])
             more = int(np.ceil((last - end) / step)) if last > end else 0
             time = np.append(process.time, end + step * np.arange(1, more + 1))
-            walks = (o.scale_walk for o in own if o.label == process.label)
+            walks = (o.scale_walk for o in own if o.label == process.label and process.walk)
             processes.append(process.going_on(time, next(walks, process.walk)))
             nodes = self.nodes[process.name]
             values[process.name] = np.concatenate([nodes, nodes[-1:].repeat(more, axis=0)])

@@ -311,7 +311,7 @@ class Dvl:
         correlated = expected_correlation(s.correlation_time_s, s.correlated_std_m_s, 3)
         time, velocity = self.time[m], self.velocity[m]
         rate = s.scale_walk_std_sqrt_h / np.sqrt(HOUR)
-        walk = ScaleWalk(SCALE_ERROR, rate, time, velocity) if rate > 0.0 else None
+        walk = ScaleWalk(SCALE_ERROR, rate, time, velocity)
         return (
             DvlVelocity(
                 time,

@@ -229,7 +229,7 @@ class ScaleWalk:
     parameter : str
         Name of the scale error, which is the mean over the trial.
     rate : float, 1/√s
-        Standard deviation of its change.
+        Standard deviation of its change; 0 where none is stated.
     time : ndarray, shape (M,), s
         Times of the measurements, in order.
     measured : ndarray, shape (M, d)

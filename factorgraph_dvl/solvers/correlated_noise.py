@@ -122,7 +122,7 @@ def correlated_noise(
                 white = factors.get(o.label, np.ones(sigma.size) * factor)
                 shown = np.maximum(np.sqrt(1.0 - share**2), LEAST_FACTOR)
                 factors[o.label] = np.where(share > 0.0, shown, white)
-        if o.scale_walk is not None and np.ptp(when) > 0.0:
+        if o.scale_walk is not None and o.scale_walk.rate > 0.0 and np.ptp(when) > 0.0:
             process = _walking(process, o.label, len(processes), o.scale_walk, sigma, when)
         if process is not None and problem.chain.interpolates and o.unit == "rad":
             process = _beside_motion(process, when)
@@ -222,6 +222,23 @@ def _walking(
         nodes = node_times(time, tau, most, sigma)
         process = Process(label, index, np.zeros(sigma.size), np.ones(sigma.size), nodes)
     return replace(process, walk=walk)
+
+
+def walking_alone(problem: Problem, i: int, index: int, walk: ScaleWalk) -> Process:
+    """Return a scale of an observation that walks, whose rate is to be estimated, as a process.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its measurements are weighed.
+    i, index : int
+        Number of the observation, and index of the process.
+    walk : ScaleWalk
+        The walk to start from.
+    """
+    sigma, when = _typical(problem.weights[i]), _used_time(problem, i)
+    label = problem.observations[i].label
+    return replace(_walking(None, label, index, walk, sigma, when), free=True)
 
 
 def _beside_motion(process: Process, time: Array) -> Process:

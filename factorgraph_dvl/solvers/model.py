@@ -333,6 +333,24 @@ def least_objective(model: Model, states: Any, values: dict[str, Array]) -> floa
     return at.objective - 2.0 * (at.minimum.evaluation.cost - decrease)
 
 
+def linear_objective(model: Model, states: Any, values: dict[str, Array]) -> float:
+    """Return the objective at the minimum of the linear model where a minimisation would start.
+
+    Parameters
+    ----------
+    model : Model
+        What is assumed.
+    states, values : object and dict of str to ndarray
+        Where its minimisation would start.
+    """
+    problem = model.problem(values)
+    there = problem.evaluate(problem.values(states, problem.prior_values() | values))
+    information, _ = quickly_factorized(problem, there, rough=True)
+    problem.release()
+    of_constants = information.decrease - information.given(constants_of(problem)).decrease
+    return restricted_objective(problem, there, information) - 2.0 * of_constants
+
+
 def with_all_digits(at: Estimated) -> Minimum:
     """Return the minimum with square-root information from QR, for its standard deviations."""
     minimum = at.minimum

@@ -11,7 +11,7 @@ import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.graph.processes import Process
+from factorgraph_dvl.graph.processes import Process, walk_time
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -43,7 +43,10 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
         Its minimum.
     """
     before = problem.processes
-    free = [p.label in problem.noise_factors and bool(p.sigma.any()) for p in before]
+    free = [
+        p.label in problem.noise_factors and bool(p.sigma.any() or (p.walk is not None and p.free))
+        for p in before
+    ]
     if not any(free):
         return before
     parameters = dict(evaluation.parameters)
@@ -59,14 +62,15 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
             nodes = at.parameters[process.name] + np.array(
                 [delta.at(process.key(j)) for j in range(process.time.size)]
             )
-            step = _step(process, nodes, information)
-            moved = max(moved, float(np.abs(step).max()))
-            found[i] = _moved(process, _extrapolated(step, last[i]))
+            step, of_walk = _step(process, nodes, information)
+            moved = max(moved, float(np.abs(step).max()), abs(of_walk))
+            found[i] = _moved(process, _extrapolated(step, last[i]), of_walk)
             last[i] = step if last[i] is None else None
             # The same error in another unit.
             grown = np.ones(process.size)
             later = found[i].sigma
             np.divide(process.sigma, later, out=grown[: later.size], where=later > 0.0)
+            grown[later.size :] = np.exp(-of_walk)
             parameters[process.name] = at.parameters[process.name] * grown
         if moved < _SAME:
             break
@@ -75,16 +79,29 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
     return after
 
 
-def _step(process: Process, nodes: Array, information: SquareRootInformation) -> Array:
-    """Return the change of the logarithms of deviation and time, (2, n); 0 where there is none."""
+def _step(
+    process: Process, nodes: Array, information: SquareRootInformation
+) -> tuple[Array, float]:
+    """Return the changes of logarithms: of deviation and time, (2, n), and of a walk's rate.
+
+    0 where there is none, or where it is as stated.
+    """
     pairs = [(process.key(j), process.key(j + 1)) for j in range(process.time.size - 1)]
     joint = np.array(information.joint_covariances(pairs))
     n, size = process.sigma.size, process.size
     variance = np.diagonal(joint, axis1=1, axis2=2)
     own = np.concatenate([variance[:1, :n], variance[:, size : size + n]])
     cross = np.diagonal(joint[:, :n, size : size + n], axis1=1, axis2=2)
-    nodes = nodes[:, :n]
     dt = np.diff(process.time)
+    of_walk = 0.0
+    if process.walk is not None and process.free:
+        weight = np.exp(-dt / walk_time(process.time))
+        step = np.column_stack([-weight, np.ones(dt.size)])
+        at = joint[:, [[size - 1], [-1]], [size - 1, -1]]
+        spread = np.einsum("ji,jik,jk->j", step, at, step)
+        change = nodes[1:, -1] - weight * nodes[:-1, -1]
+        of_walk = 0.5 * float(np.log(np.mean((change**2 + spread) / (1.0 - weight**2))))
+    nodes = nodes[:, :n]
     spacing = float(np.median(dt))
     regular = np.abs(dt / spacing - 1.0) < 0.5
     square = nodes**2 + own
@@ -101,7 +118,7 @@ def _step(process: Process, nodes: Array, information: SquareRootInformation) ->
     active = process.sigma > 0.0
     ratio = np.where(active, sigma, 1.0) / np.where(active, process.sigma, 1.0)
     step = np.stack([np.log(ratio), np.where(active, np.log(tau / process.tau), 0.0)])
-    return _above_least(process, step)
+    return _above_least(process, step), of_walk
 
 
 def _above_least(process: Process, step: Array) -> Array:
@@ -122,10 +139,13 @@ def _extrapolated(step: Array, before: Array | None) -> Array:
     return np.asarray(step / (1.0 - np.clip(ratio, 0.0, _MOST_RATIO)))
 
 
-def _moved(process: Process, step: Array) -> Process:
-    """Return a process after a step of the logarithms."""
+def _moved(process: Process, step: Array, of_walk: float) -> Process:
+    """Return a process after steps of the logarithms."""
     step = _above_least(process, np.clip(step, -_LARGEST, _LARGEST))
     tau = process.tau * np.exp(step[1])
     if process.least_sigma is None:
         tau = np.minimum(tau, float(np.ptp(process.time)))
-    return replace(process, sigma=process.sigma * np.exp(step[0]), tau=tau)
+    walk = process.walk
+    if walk is not None:
+        walk = replace(walk, rate=walk.rate * float(np.exp(of_walk)))
+    return replace(process, sigma=process.sigma * np.exp(step[0]), tau=tau, walk=walk)

@@ -34,8 +34,10 @@ from factorgraph_dvl.solvers.model import (
     with_all_digits,
 )
 from factorgraph_dvl.solvers.preparation import Preparation, Prepared
+from factorgraph_dvl.solvers.scale_walks import scale_walk_findings
 from factorgraph_dvl.solvers.steps import (
     Averaging,
+    ChangedScales,
     Correlation,
     Gates,
     GrossErrors,
@@ -45,6 +47,7 @@ from factorgraph_dvl.solvers.steps import (
     MotionStrengths,
     Noise,
     Proposal,
+    ScaleWalks,
     States,
     Step,
     Uncorrelated,
@@ -123,8 +126,9 @@ def settle(
     known = KnownParameters(at)
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(), known,
-        Noise(), ImuNoise(), Uncorrelated(), KnownParametersAgain(known), walks,
+        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(),
+        ScaleWalks(), known, ChangedScales(), Noise(), ImuNoise(), Uncorrelated(),
+        KnownParametersAgain(known), walks,
     ]  # fmt: skip
     if roughly:
         steps = [
@@ -161,6 +165,7 @@ def settle(
         *_imu_findings(at),
         *walks.findings,
         *averaging_findings(prepared.parameters, at),
+        *scale_walk_findings(at),
         *explanation_findings(known.estimated_by(at.model), known.left, at.minimum.evaluation),
     )
     if going_on:

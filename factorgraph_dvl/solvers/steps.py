@@ -6,7 +6,7 @@ after the first are nearer to the present one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -32,11 +32,12 @@ from factorgraph_dvl.solvers.correlated_noise import (
 from factorgraph_dvl.solvers.imu_noise import NOISE_KEYS, lower_noise
 from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, is_needless, wide
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.model import Estimated, Model
+from factorgraph_dvl.solvers.model import Estimated, Model, linear_objective
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
+from factorgraph_dvl.solvers.scale_walks import in_place_of, instead_of_a_change
 from factorgraph_dvl.statistics.variance_components import variance_components
 
 # Shares of a change of noise that are tried in turn. Chosen: what is left changes no σ.
@@ -273,6 +274,56 @@ class Correlation:
             # What wanders for long is no outlier.
             robust_weights={} if persists else model.robust_weights,
         )
+
+
+class ScaleWalks:
+    """Scales that walk, in place of noise that persists."""
+
+    name = "walk of a scale"
+
+    def __init__(self) -> None:
+        self._asked = _Asked()
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield models in which a scale walks and the noise of its sensor is white."""
+        model = at.model
+        own = model.prepared, model.parameters, _labels(model)
+        if not at.minimum.converged or model.chain.interpolates or self._asked.before(*own):
+            return
+        self._asked.note(*own)
+        stated = {p.label for p in model.stated_processes}
+        for process in model.processes:
+            if process.label not in stated:
+                every = (
+                    tuple(walking if p is process else p for p in model.processes)
+                    for walking in in_place_of(at.problem, process)
+                )
+                yield from _most_promising([_from(at, processes=each) for each in every], at)
+
+
+class ChangedScales(ScaleWalks):
+    """Scales that walk, where they change along the trial."""
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield models in which a scale walks that would change once otherwise."""
+        model = at.model
+        own = model.prepared, model.parameters, _labels(model)
+        if not at.minimum.converged or model.chain.interpolates or self._asked.before(*own):
+            return
+        self._asked.note(*own)
+        every = [
+            replace(_from(at, processes=(*model.processes, walking)), price=fall)
+            for walking, fall in instead_of_a_change(at.problem, at.minimum)
+        ]
+        yield from _most_promising(every, at)
+
+
+def _most_promising(every: Sequence[Proposal], at: Estimated) -> Iterator[Proposal]:
+    """Yield the proposal with the lowest objective by the linear model, where that is lower."""
+    at.problem.release()
+    expected = [linear_objective(p.model, p.states, p.values) + p.price for p in every]
+    if every and min(expected) < at.objective:
+        yield every[int(np.argmin(expected))]
 
 
 class Uncorrelated:
@@ -575,10 +626,14 @@ def _between(before: Process, after: Process, share: float) -> Process:
         return after
     active = before.sigma > 0.0
     ratio = np.divide(after.sigma, before.sigma, out=np.ones(active.size), where=active)
+    walk = before.walk
+    if walk is not None and after.walk is not None and walk.rate > 0.0:
+        walk = replace(walk, rate=walk.rate * (after.walk.rate / walk.rate) ** share)
     return replace(
         before,
         sigma=before.sigma * ratio**share,
         tau=before.tau * (after.tau / before.tau) ** share,
+        walk=walk,
     )
 
 
