@@ -231,23 +231,35 @@ def others(program: Path | None, commit: str | None) -> Iterator[tuple[str, str,
         config["trial"] = {"imu": config["trial"]["imu"]}
         everything = folder / "everything.yaml"
         everything.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
-        cruise, estimated = folder / "cruise", folder / "everything"
-        run_cli("simulate", CRUISE, "--out", cruise, "--seed", 1)
-        run_cli("simulate", everything, "--out", estimated, "--seed", 1)
-        for number, (what, trial, more) in enumerate(
+        plans = {"cruise": CRUISE, "everything": everything}
+        # Each program has trials that it wrote itself: keys differ.
+        own, theirs = (
+            trials_of(plans, folder / name, of) for name, of in (("own", None), ("theirs", source))
+        )
+        for number, (what, name, more) in enumerate(
             (
-                ("cruise, files to files with figures", cruise, ()),
-                ("cruise, `--no-figures`", cruise, ("--no-figures",)),
-                ("cruise with clocks, antenna and DVL bias estimated", estimated, ()),
-                ("shipped trial, files to files with figures", SHIPPED, ()),
+                ("cruise, files to files with figures", "cruise", ()),
+                ("cruise, `--no-figures`", "cruise", ("--no-figures",)),
+                ("cruise with clocks, antenna and DVL bias estimated", "everything", ()),
+                ("shipped trial, files to files with figures", SHIPPED.name, ()),
             )
         ):
-            runs: dict[str, Callable[[Path], Run]] = {"": partial(solved, trial, more, None)}
+            runs: dict[str, Callable[[Path], Run]] = {"": partial(solved, own[name], more, None)}
             if source is not None:
-                runs[f"commit {commit}"] = partial(solved, trial, more, source)
-            if program is not None and trial == cruise:
-                runs["KF-GINS"] = partial(filtered, program, trial)
+                runs[f"commit {commit}"] = partial(solved, theirs[name], more, source)
+            if program is not None and name == "cruise":
+                runs["KF-GINS"] = partial(filtered, program, own[name])
             yield from ratios(what, in_turn(runs, folder / f"{number}"))
+
+
+def trials_of(plans: Mapping[str, Path], folder: Path, source: Path | None) -> dict[str, Path]:
+    """Simulate plans with this package, or that of another folder; return all trials by name."""
+    folder.mkdir()
+    out = {name: folder / name for name in plans}
+    for name, plan in plans.items():
+        arguments = ("simulate", f"{plan}", "--out", f"{out[name]}", "--seed", "1")
+        run_python("-m", "factorgraph_dvl.cli", *arguments, source=source)
+    return out | {SHIPPED.name: (source or ROOT) / SHIPPED.relative_to(ROOT)}
 
 
 def ratios(what: str, best: Mapping[str, Run]) -> Iterator[tuple[str, str, str]]:
