@@ -91,8 +91,9 @@ def main() -> None:
     lines: list[str] = []
     for title, rows in (
         ("Command line", command_line()),
-        (f"Calibration cruise of {cruise_duration():.0f} s", cruise(long=args.long)),
+        # While this process is small: a child begins with its memory.
         ("In turn with others", others(args.kf_gins, args.against)),
+        (f"Calibration cruise of {cruise_duration():.0f} s", cruise(long=args.long)),
         ("Coning and sculling", coning()),
     ):
         print(f"\n{title}", flush=True)
