@@ -235,9 +235,8 @@ def others(program: Path | None, commit: str | None) -> Iterator[tuple[str, str,
         everything.write_text(yaml.safe_dump(config, sort_keys=False), encoding="utf-8")
         plans = {"cruise": CRUISE, "everything": everything}
         # Each program has trials that it wrote itself: keys differ.
-        own, theirs = (
-            trials_of(plans, folder / name, of) for name, of in (("own", None), ("theirs", source))
-        )
+        own = trials_of(plans, folder / "own", None)
+        theirs = {} if source is None else trials_of(plans, folder / "theirs", source)
         for number, (what, name, more) in enumerate(
             (
                 ("cruise, files to files with figures", "cruise", ()),

@@ -36,6 +36,14 @@ DVL = (
 )
 
 
+def nees_of(solution, trial, names=DVL):
+    """Return the NEES of some components of a solution's calibration."""
+    errors = calibration_errors(solution, trial.calibration_truth)
+    rows = [errors.names.index(name) for name in names]
+    P = errors.covariance[np.ix_(rows, rows)]
+    return float(errors.error[rows] @ np.linalg.solve(P, errors.error[rows]))
+
+
 @dataclass(frozen=True)
 class Run:
     """Of one seed: errors, covariance and prior of the calibration, mean squares over time."""

@@ -76,6 +76,11 @@ class Process:
         """Whether only the density is sure, and the deviation is as stated, or larger."""
         return self.least_sigma is not None
 
+    @property
+    def free_walk(self) -> ScaleWalk | None:
+        """The walk whose rate is to be estimated, if there is one."""
+        return self.walk if self.free else None
+
     def going_on(self, time: Array, walk: ScaleWalk | None) -> Process:
         """Return it at other nodes, of which the first was among its own.
 

@@ -324,8 +324,7 @@ def least_objective(model: Model, states: Any, values: dict[str, Array]) -> floa
     states, values : object and dict of str to ndarray
         Where its minimisation would start.
     """
-    problem = model.problem(values)
-    start = problem.evaluate(problem.values(states, problem.prior_values() | values))
+    problem, start = _at_start(model, states, values)
     there = Minimum(problem.weighed(start), None, converged=True, iterations=0)
     at = with_objective(model, problem, there, rough=True)
     problem.release()
@@ -336,19 +335,19 @@ def least_objective(model: Model, states: Any, values: dict[str, Array]) -> floa
 def linear_objective(model: Model, states: Any, values: dict[str, Array]) -> float:
     """Return the objective at the minimum of the linear model where a minimisation would start.
 
-    Parameters
-    ----------
-    model : Model
-        What is assumed.
-    states, values : object and dict of str to ndarray
-        Where its minimisation would start.
+    Parameters are those of `least_objective`.
     """
-    problem = model.problem(values)
-    there = problem.evaluate(problem.values(states, problem.prior_values() | values))
+    problem, there = _at_start(model, states, values)
     information, _ = quickly_factorized(problem, there, rough=True)
     problem.release()
     of_constants = information.decrease - information.given(constants_of(problem)).decrease
     return restricted_objective(problem, there, information) - 2.0 * of_constants
+
+
+def _at_start(model: Model, states: Any, values: dict[str, Array]) -> tuple[Problem, Evaluation]:
+    """Return the problem of a model, and its evaluation where its minimisation would start."""
+    problem = model.problem(values)
+    return problem, problem.evaluate(problem.values(states, problem.prior_values() | values))
 
 
 def with_all_digits(at: Estimated) -> Minimum:

@@ -44,7 +44,7 @@ def refitted(problem: Problem, evaluation: Evaluation) -> tuple[Process, ...]:
     """
     before = problem.processes
     free = [
-        p.label in problem.noise_factors and bool(p.sigma.any() or (p.walk is not None and p.free))
+        p.label in problem.noise_factors and bool(p.sigma.any() or p.free_walk is not None)
         for p in before
     ]
     if not any(free):
@@ -94,7 +94,7 @@ def _step(
     cross = np.diagonal(joint[:, :n, size : size + n], axis1=1, axis2=2)
     dt = np.diff(process.time)
     of_walk = 0.0
-    if process.walk is not None and process.free:
+    if process.free_walk is not None:
         weight = np.exp(-dt / walk_time(process.time))
         step = np.column_stack([-weight, np.ones(dt.size)])
         at = joint[:, [[size - 1], [-1]], [size - 1, -1]]

@@ -46,7 +46,8 @@ def in_place_of(problem: Problem, process: Process) -> Iterator[Process]:
         density = process.sigma * np.sqrt(2.0 / process.tau)
         largest = int(np.argmax(density))
         if speed[largest] > 0.0:
-            yield from _from(problem, i, process.index, float(density[largest] / speed[largest]))
+            rate = float(density[largest] / speed[largest])
+            yield from _about(problem, i, process.index, walk, rate)
 
 
 def instead_of_a_change(problem: Problem, minimum: Minimum) -> Iterator[tuple[Process, float]]:
@@ -77,7 +78,7 @@ def instead_of_a_change(problem: Problem, minimum: Minimum) -> Iterator[tuple[Pr
         ]
         if sizes:
             rate = max(sizes) / float(np.sqrt(np.ptp(o.time)))
-            for walking in _from(problem, i, index, rate):
+            for walking in _about(problem, i, index, walk, rate):
                 yield walking, most.change.fall
 
 
@@ -88,23 +89,24 @@ def _walks(problem: Problem) -> Iterator[tuple[int, ScaleWalk]]:
             yield i, o.scale_walk
 
 
-def _from(problem: Problem, i: int, index: int, rate: float) -> Iterator[Process]:
+def _about(
+    problem: Problem, i: int, index: int, walk: ScaleWalk, rate: float
+) -> Iterator[Process]:
     """Yield a scale that walks, from several rates about one."""
-    walk = problem.observations[i].scale_walk
-    assert walk is not None
     for start in _STARTS:
         yield walking_alone(problem, i, index, replace(walk, rate=start * rate))
 
 
 def scale_walk_findings(at: Estimated) -> tuple[Finding, ...]:
     """Return a finding of each scale that was found to walk."""
+    walks = ((p.label, p.free_walk) for p in at.problem.processes)
     return tuple(
         Finding(
             Code.ESTIMATED_INSTEAD,
-            message("estimated_instead.scale_walk", name=_KEY, value=p.walk.rate * np.sqrt(HOUR)),
-            sensor=p.label,
-            parameter=p.walk.parameter,
+            message("estimated_instead.scale_walk", name=_KEY, value=walk.rate * np.sqrt(HOUR)),
+            sensor=label,
+            parameter=walk.parameter,
         )
-        for p in at.problem.processes
-        if p.walk is not None and p.free
+        for label, walk in walks
+        if walk is not None
     )

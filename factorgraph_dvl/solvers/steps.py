@@ -6,7 +6,7 @@ after the first are nearer to the present one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -285,45 +285,41 @@ class ScaleWalks:
         self._asked = _Asked()
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield models in which a scale walks and the noise of its sensor is white."""
+        """Yield the walks with the lowest objective by the linear model, where that is lower."""
         model = at.model
         own = model.prepared, model.parameters, _labels(model)
         if not at.minimum.converged or model.chain.interpolates or self._asked.before(*own):
             return
         self._asked.note(*own)
-        stated = {p.label for p in model.stated_processes}
-        for process in model.processes:
+        for every in self._alternatives(at):
+            if not every:
+                continue
+            at.problem.release()
+            expected = [linear_objective(p.model, p.states, p.values) + p.price for p in every]
+            if min(expected) < at.objective:
+                yield every[int(np.argmin(expected))]
+
+    def _alternatives(self, at: Estimated) -> Iterator[list[Proposal]]:
+        """Yield models in which a scale walks and the noise of its sensor is white."""
+        stated = {p.label for p in at.model.stated_processes}
+        for process in at.model.processes:
             if process.label not in stated:
                 every = (
-                    tuple(walking if p is process else p for p in model.processes)
+                    tuple(walking if p is process else p for p in at.model.processes)
                     for walking in in_place_of(at.problem, process)
                 )
-                yield from _most_promising([_from(at, processes=each) for each in every], at)
+                yield [_from(at, processes=each) for each in every]
 
 
 class ChangedScales(ScaleWalks):
     """Scales that walk, where they change along the trial."""
 
-    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+    def _alternatives(self, at: Estimated) -> Iterator[list[Proposal]]:
         """Yield models in which a scale walks that would change once otherwise."""
-        model = at.model
-        own = model.prepared, model.parameters, _labels(model)
-        if not at.minimum.converged or model.chain.interpolates or self._asked.before(*own):
-            return
-        self._asked.note(*own)
-        every = [
-            replace(_from(at, processes=(*model.processes, walking)), price=fall)
+        yield [
+            replace(_from(at, processes=(*at.model.processes, walking)), price=fall)
             for walking, fall in instead_of_a_change(at.problem, at.minimum)
         ]
-        yield from _most_promising(every, at)
-
-
-def _most_promising(every: Sequence[Proposal], at: Estimated) -> Iterator[Proposal]:
-    """Yield the proposal with the lowest objective by the linear model, where that is lower."""
-    at.problem.release()
-    expected = [linear_objective(p.model, p.states, p.values) + p.price for p in every]
-    if every and min(expected) < at.objective:
-        yield every[int(np.argmin(expected))]
 
 
 class Uncorrelated:

@@ -89,12 +89,12 @@ def add_transposed_product(rows: Rows, factors: Array, sums: dict[int, Array]) -
     sums : dict of int to ndarray
         Sums by key, which are changed.
     """
-    variables: dict[bytes, list[tuple[IntArray, Array]]] = {}
+    variables: dict[bytes, tuple[IntArray, list[tuple[IntArray, Array]]]] = {}
     for own, matrix in _by_variable(rows):
-        variables.setdefault(_runs(own).tobytes(), []).append((own, matrix))
+        first = _runs(own)
+        variables.setdefault(first.tobytes(), (first, []))[1].append((own, matrix))
     width = factors.shape[2]
-    for together in variables.values():
-        first = _runs(together[0][0])
+    for first, together in variables.values():
         lengths = np.diff(first, append=len(factors))
         for length in np.unique(lengths).tolist():
             begins = first[lengths == length]

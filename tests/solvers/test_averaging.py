@@ -8,11 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from monte_carlo import RUNS
+from monte_carlo import DVL, RUNS, nees_of
 from scipy.stats import chi2
 from truth import CONFIGS, scenario
 
-from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.initialization.clock_offsets import ClockOffset
 from factorgraph_dvl.plausibility.clocks import clock_findings
@@ -23,11 +22,6 @@ from factorgraph_dvl.solvers.averaging import without_hidden
 from factorgraph_dvl.solvers.batch import solve, solved_problems
 from factorgraph_dvl.solvers.record_scores import by_square
 
-MOUNT = (
-    *(f"misalignment_{axis}_deg" for axis in "xyz"),
-    "scale_error",
-    *(f"lever_arm_{axis}_m" for axis in "xyz"),
-)
 SWELL_HZ = 0.3
 
 
@@ -47,17 +41,6 @@ def trial_of(length_s, seed, **claims):
     return simulate(parse_scenario(plan), seed)
 
 
-def mount_nees(solution, trial):
-    return nees_of(solution, trial, MOUNT)
-
-
-def nees_of(solution, trial, names):
-    errors = calibration_errors(solution, trial.calibration_truth)
-    rows = [errors.names.index(name) for name in names]
-    P = errors.covariance[np.ix_(rows, rows)]
-    return float(errors.error[rows] @ np.linalg.solve(P, errors.error[rows]))
-
-
 def sigma_of(solution, name):
     i = solution.order.index(name)
     return float(np.sqrt(solution.covariance[i][i]))
@@ -67,12 +50,12 @@ def sigma_of(solution, name):
 def test_a_stated_window_costs_no_precision_and_a_window_of_none_is_left_alone():
     trial = trial_of(0.5, 1, averaging_s=0.5)
     stated = solve(trial)
-    assert mount_nees(stated, trial) < chi2.ppf(0.999, 7)
+    assert nees_of(stated, trial) < chi2.ppf(0.999, 7)
     none = trial_of(0.0, 1, averaging_s=0.0, averaging_std_s=0.0)
     certain = solve(none)
     for found in (stated, certain):
         assert "averaging_s" not in found.order
-    for name in MOUNT:
+    for name in DVL:
         assert sigma_of(stated, name) < 1.1 * sigma_of(certain, name)
 
 
@@ -82,7 +65,7 @@ def test_a_window_that_is_not_stated_is_found():
     found = solve(trial)
     length = found.estimate("averaging_s")
     assert abs(length.value[0] - 0.5) < 4.0 * length.std[0] < 0.1
-    assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
+    assert nees_of(found, trial) < chi2.ppf(0.999, 7)
 
 
 @pytest.mark.slow
@@ -98,7 +81,7 @@ def test_noise_of_gyros_hides_no_window(grade):
     found = solve(trial)
     assert found.verdict.grade == "good"
     assert abs(found.estimate("averaging_s").value[0] - 0.5) < 0.05
-    assert mount_nees(found, trial) < chi2.ppf(0.999, 7)
+    assert nees_of(found, trial) < chi2.ppf(0.999, 7)
 
 
 @pytest.mark.slow
@@ -134,7 +117,7 @@ def test_standard_deviations_hold_whatever_the_window(length_s):
     for seed in range(RUNS):
         trial = trial_of(length_s, seed)
         found = solve(trial)
-        nees.append(mount_nees(found, trial))
+        nees.append(nees_of(found, trial))
         if "averaging_s" in found.order:
             length = found.estimate("averaging_s")
             of_length.append((length.value[0] - length_s) / length.std[0])
@@ -150,7 +133,7 @@ def test_a_stamp_at_the_end_is_half_a_window_late():
     late = replace(trial, dvl=replace(trial.dvl, time=trial.dvl.time + 0.5))
     assert late.dvl.settings.stamp == "middle"
     found = solve(late)
-    assert mount_nees(found, late) < chi2.ppf(0.999, 7)
+    assert nees_of(found, late) < chi2.ppf(0.999, 7)
     assert found.verdict.grade == "good"
 
 
@@ -223,7 +206,7 @@ def test_standard_deviations_hold_whatever_the_window_of_gnss(length_s, late):
     for seed in range(RUNS):
         trial = trial_of_gnss(length_s, delay_s, seed)
         found = solve(trial, rate_hz=1.0)
-        nees.append(mount_nees(found, trial))
+        nees.append(nees_of(found, trial))
         of_antenna.append(nees_of(found, trial, ANTENNA))
         times = [found.estimate(name) for name in truth if name in found.order]
         of_times += [((e.value[0] - truth[e.name]) / e.std[0]) ** 2 for e in times]

@@ -5,21 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import yaml
-from monte_carlo import RUNS
+from monte_carlo import RUNS, nees_of
 from scipy.stats import chi2
 from truth import CONFIGS
 
-from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solve_with_problem
 from factorgraph_dvl.solvers.process_fit import refitted
-
-SEVEN = (
-    *(f"misalignment_{axis}_deg" for axis in "xyz"),
-    "scale_error",
-    *(f"lever_arm_{axis}_m" for axis in "xyz"),
-)
 
 
 def trial_of(seed, **dvl):
@@ -28,13 +21,6 @@ def trial_of(seed, **dvl):
     plan["dvl"] |= dvl
     plan["trial"]["dvl"] |= {"scale_walk_std_sqrt_h": 0.0}
     return simulate(parse_scenario(plan), seed)
-
-
-def nees_of(solution, trial):
-    errors = calibration_errors(solution, trial.calibration_truth)
-    rows = [errors.names.index(name) for name in SEVEN]
-    P = errors.covariance[np.ix_(rows, rows)]
-    return float(errors.error[rows] @ np.linalg.solve(P, errors.error[rows]))
 
 
 def test_a_walk_that_is_not_stated_is_found():
