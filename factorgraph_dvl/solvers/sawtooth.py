@@ -6,6 +6,9 @@ s = -Jᵀ r and the information w = Jᵀ J on its own delay. The highest lines o
 near the period; folded by a period P, s and w show the sawtooth g with the highest
 
     (Σ s g)² / Σ w g²,    g = (t - start) / P mod 1, less its weighted mean.
+
+What is left of s without it says how noise scatters: a delay itself has lines everywhere, where the
+vehicle sways.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ _PERIODS, _MEASUREMENTS = 4, 4
 # Span over what its measurements take at their interval, from which on a record is in pieces, or
 # its clock jumps. Chosen: the spectrum takes memory for all of the span.
 _SPARSE = 10.0
-# Lines of the spectrum that are folded. Chosen: sway makes others of each.
+# Lines of the spectrum that are folded, of the highest and of those that stand out. Chosen: sway
+# makes others of each.
 _LINES = 3
 # Starts that are tried, first to last. Chosen: at the end, a delay of 0.1 s is known to 0.1 ms.
 _STARTS = (64, 1024, 1024)
@@ -49,7 +53,7 @@ class Sawtooth:
     tried : int
         Periods and starts that could have been it.
     scatter : float
-        Median power of lines beside it, over that of white noise; at least one.
+        Median power of lines beside it, over that of white noise, of what it leaves; at least one.
     """
 
     period: float
@@ -77,16 +81,17 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
     if span > _SPARSE * interval * stamps.size:
         return None
     places = np.round(since / interval).astype(np.intp)
-    series = np.bincount(places, score)
-    power = np.abs(np.fft.rfft(series)) ** 2
+    power = np.abs(np.fft.rfft(np.bincount(places, score))) ** 2
     # Line k has k periods in the trial.
     last = min(power.size, stamps.size // _MEASUREMENTS)
-    # Noise that persists has more of slow lines.
-    noise = median_filter(power[_PERIODS:last], _BESIDE, mode="nearest") / np.log(2.0)
-    noise = np.maximum(noise / information.sum(), 1.0)
-    lines = float(_PERIODS) + np.argsort(power[_PERIODS:last] / noise)[-_LINES:]
-    if not lines.size:
+    if last <= _PERIODS:
         return None
+    # Noise that persists has more of slow lines.
+    standing_out = power[_PERIODS:last] / _noise(power[_PERIODS:last], information)
+    highest = {
+        k for each in (power[_PERIODS:last], standing_out) for k in np.argsort(each)[-_LINES:]
+    }
+    lines = np.array(sorted(highest)) + float(_PERIODS)
     found = []
     for level, starts in enumerate(_STARTS):
         around = (2.0 / _AROUND) ** level * np.linspace(-1.0, 1.0, _AROUND)
@@ -95,10 +100,28 @@ def best_sawtooth(time: Array, score: Array, information: Array) -> Sawtooth | N
         best = int(np.argmax([fall for fall, _ in found]))
         lines = tried[best : best + 1]
     fall, phase = found[best]
-    period = span / float(lines[0])
-    nearest = int(np.clip(round(float(lines[0])) - _PERIODS, 0, noise.size - 1))
-    start, tried_in_all = float(stamps[0] + phase * period), int(last) * _STARTS[-1]
+    line = float(lines[0])
+    left = score - _explained(since * (line / span) - phase, score, information)
+    power = np.abs(np.fft.rfft(np.bincount(places, left))) ** 2
+    noise = _noise(power[_PERIODS:last], information)
+    nearest = int(np.clip(round(line) - _PERIODS, 0, noise.size - 1))
+    period, tried_in_all = span / line, int(last) * _STARTS[-1]
+    start = float(stamps[0] + phase * period)
     return Sawtooth(period, start, fall, tried_in_all, float(noise[nearest]))
+
+
+def _noise(power: Array, information: Array) -> Array:
+    """Return the median power beside each line, over that of white noise; at least one."""
+    beside = median_filter(power, _BESIDE, mode="nearest") / np.log(2.0)
+    return np.maximum(beside / information.sum(), 1.0)
+
+
+def _explained(turns: Array, score: Array, information: Array) -> Array:
+    """Return what a sawtooth, and a mean delay beside it, are of the scores."""
+    shape = np.mod(turns, 1.0)
+    shape -= information @ shape / information.sum()
+    size = score @ shape / max(information @ shape**2, 1e-12 * information.sum())
+    return information * (size * shape + score.sum() / information.sum())
 
 
 def _folded(turns: Array, score: Array, information: Array, starts: int) -> tuple[float, float]:
