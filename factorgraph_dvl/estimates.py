@@ -164,6 +164,26 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class NoiseBySpeed:
+    """Noise of a velocity log, where its two parts are not as stated.
+
+    Parameters
+    ----------
+    std : float, m/s
+        Standard deviation of the part that is constant.
+    fraction : float
+        Standard deviation of the part that grows with speed, over the speed.
+    stated_std, stated_fraction : float
+        The same as stated.
+    """
+
+    std: float
+    fraction: float
+    stated_std: float
+    stated_fraction: float
+
+
+@dataclass(frozen=True)
 class Noise:
     """Noise of a measurement against what is stated of it.
 
@@ -179,12 +199,16 @@ class Noise:
         whose noise is white, None where all are.
     correlated_std : ndarray, shape (d,), optional
         Standard deviation of what persists, in the unit of the measurement.
+    by_speed : NoiseBySpeed, optional
+        What is constant of the noise, and what grows with speed; None where it is as stated but
+        for the factor.
     """
 
     name: str
     factor: Array
     correlation_time: Array | None = None
     correlated_std: Array | None = None
+    by_speed: NoiseBySpeed | None = None
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from factorgraph_dvl.errors import DataError, printable
-from factorgraph_dvl.estimates import Cause, Estimate, Noise
+from factorgraph_dvl.estimates import Cause, Estimate, Noise, NoiseBySpeed
 from factorgraph_dvl.geometry.rotations import BodyAxes
 from factorgraph_dvl.geometry.unit_vectors import turns_to
 from factorgraph_dvl.geometry.units import DEG
@@ -91,6 +91,7 @@ class _Noise(msgspec.Struct, omit_defaults=True):
     factor: _Numbers
     correlation_time_s: _Numbers | None = None
     correlated_std: _Numbers | None = None
+    by_speed: NoiseBySpeed | None = None
 
 
 class _Cause(msgspec.Struct):
@@ -176,6 +177,7 @@ def load_calibration(path: Path | str, *, body_axes: BodyAxes = "RFU") -> Calibr
                 np.array(n.factor, dtype=float),
                 _optional(n.correlation_time_s),
                 _optional(n.correlated_std),
+                n.by_speed,
             )
             for name, n in file.noise.items()
         ),
@@ -322,6 +324,7 @@ def encode_calibration(solution: Solution | Calibration) -> bytes:
                 _numbers(n.factor),
                 None if n.correlation_time is None else _numbers(n.correlation_time),
                 None if n.correlated_std is None else _numbers(n.correlated_std),
+                n.by_speed,
             )
             for n in solution.noise
         },

@@ -91,6 +91,11 @@ class ObservationRows:
         return self.whole.scale_walk
 
     @property
+    def noise_by_speed(self) -> tuple[float, float] | None:
+        """Standard deviation that is constant, m/s, and what grows, over the speed."""
+        return self.whole.noise_by_speed
+
+    @property
     def independent(self) -> bool:
         """Whether components are measured apart."""
         return self.whole.independent

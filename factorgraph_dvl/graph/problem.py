@@ -95,6 +95,9 @@ class Problem:
     noise_factors : mapping of str to ndarray
         Factors (d,) of each label on the standard deviations that sensors state for their own
         noise; 1 where there are none. `weigh` applies them.
+    noise_growth : mapping of str to ndarray
+        Factors (2,) of each label beside these, on the part of noise that is constant and on what
+        grows with speed; one on average. Likewise.
     long_run : mapping of str to ndarray
         Factors (d,) of each label for noise that persists for some measurements; likewise.
     gain : float
@@ -146,6 +149,7 @@ class Problem:
         self.uncovered: dict[str, int] = {}
         self.rejected: Mapping[str, Array] = {}
         self.noise_factors: Mapping[str, Array] = {}
+        self.noise_growth: Mapping[str, Array] = {}
         self.long_run: Mapping[str, Array] = {}
         self.gain = 0.0
         self.robust_weights: Mapping[str, Array] = {}
@@ -448,6 +452,8 @@ class Problem:
         ):
             label = bound.observation.label
             own = factors.get(label, 1.0) * self.long_run.get(label, 1.0)
+            if label in self.noise_growth:
+                own = self.noise_growth[label][:, None] * own
             values = bound.values(evaluation.parameters, self.processes_of(bound))
             sigma = bound.observation.sigma(motion, values, own)
             missing = bound.missing(at, motion, evaluation.parameters, self.processes_of(bound))

@@ -30,6 +30,9 @@ _AT_AN_END = 3
 _REPEATED = 5
 _STEPS = 6.0
 _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
+# Share of values that are written more than once, and how much more often than chance repeats all
+# components, from which on a log is faster than its instrument. Chosen: one is so at any rate.
+_HELD, _BY_CHANCE = 0.1, 0.1
 # Share of the samples of the IMU that may be frozen. Chosen: more are written several times each.
 _MOST_FROZEN = 0.3
 # Latitude, longitude and height on one scale, deg: a metre is 1e-5 deg.
@@ -138,6 +141,10 @@ def _blank(
     if frozen.any():
         words.append(message("invalid_values.repeated", count=int(frozen.sum())))
         none[frozen] = True
+    held = _held(np.where(none, np.nan, values), moving)
+    if held.any():
+        words.append(message("invalid_values.held", count=int(held.sum())))
+        none[held] = True
     if words:
         kept = np.where(none, np.nan, values)
         for i, name in enumerate(names):
@@ -163,8 +170,12 @@ def _blank_fixes(columns: dict[str, Array], source: str, findings: list[Finding]
         words.append(message("invalid_values.zero_fixes", count=int(zero.sum())))
     if frozen.any():
         words.append(message("invalid_values.repeated_fixes", count=int(frozen.sum())))
+    none = zero | frozen
+    held = _held(np.where(none[:, None], np.nan, values), ~none)
+    if held.any():
+        words.append(message("invalid_values.held", count=int(held.sum())))
     if words:
-        kept = np.where((zero | frozen)[:, None], np.nan, values)
+        kept = np.where((none | held)[:, None], np.nan, values)
         for i, name in enumerate(POSITION_COLUMNS):
             columns[name] = kept[:, i]
         findings.append(_finding("GNSS", source, words))
@@ -210,6 +221,26 @@ def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
         surely = jumps or (moving[there[begin]] and not by_chance)
         if end - begin + 1 >= _REPEATED and surely:
             out[there[begin + 1 : end + 1]] = True
+    return out
+
+
+def _held(values: Array, moving: BoolArray) -> BoolArray:
+    """Return which rows (M, n) were written before, by a log that is faster than its instrument.
+
+    Of rows that are `moving` (M,). Those repeat all components more often than their own repeats
+    make it by chance.
+    """
+    there = np.flatnonzero(moving & ~np.isnan(values).any(axis=1))
+    out = np.zeros(moving.size, dtype=bool)
+    same = np.diff(values[there], axis=0) == 0.0
+    every = same.all(axis=1) & (np.diff(there) == 1)
+    written_again = runs(every)[0].size
+    new = int(np.count_nonzero(~every))
+    if min(written_again, new) < _REPEATED:
+        return out
+    share = written_again / (new + 1)
+    if share > _HELD and np.prod(same[~every].mean(axis=0)) < _BY_CHANCE * share:
+        out[there[1:][every]] = True
     return out
 
 

@@ -7,11 +7,18 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.special import chdtrc
 
-from factorgraph_dvl.estimates import Estimate, Hypothesis, Noise, Residuals, noise_name
+from factorgraph_dvl.estimates import (
+    Estimate,
+    Hypothesis,
+    Noise,
+    NoiseBySpeed,
+    Residuals,
+    noise_name,
+)
 from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.vectors import Array, BoolArray
 from factorgraph_dvl.message import Message, message
-from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.finding import Code, Finding, Severity
 from factorgraph_dvl.quality.scale_causes import scale_cause
 from factorgraph_dvl.sensors.averaging import is_window
 from factorgraph_dvl.sensors.protocol import Aid
@@ -87,6 +94,8 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     rms = float(np.sqrt(np.nanmean(square))) if r.time.size else 0.0
     least = 1.0 if factor is None else float(np.nanmin(factor))
     small = least < NOISE_FACTORS[0]
+    if noise is not None and noise.by_speed is not None and rms <= DO_NOT_FIT:
+        return [_by_speed(r.label, noise.by_speed)]
     if rms <= TOO_LARGE:
         text = message("small_residuals.noise", ratio=least)
         return [Finding(Code.SMALL_RESIDUALS, text, sensor=r.label)] if small else []
@@ -111,6 +120,21 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
             components=list(r.components),
         )
     return [Finding(code, text, sensor=r.label, severity=severity)]
+
+
+def _by_speed(label: str, noise: NoiseBySpeed) -> Finding:
+    """Return what the noise of a velocity log is."""
+    factors = noise.std / noise.stated_std, noise.fraction / noise.stated_fraction
+    allowed = NOISE_FACTORS[0] <= min(factors) and max(factors) <= NOISE_FACTORS[1]
+    text = message(
+        "large_residuals.by_speed",
+        std=noise.std,
+        fraction=noise.fraction,
+        stated_std=noise.stated_std,
+        stated_fraction=noise.stated_fraction,
+    )
+    severity: Severity = "note" if allowed else "warning"
+    return Finding(Code.LARGE_RESIDUALS, text, sensor=label, severity=severity)
 
 
 def _by_chance(r: Residuals, noise: Noise) -> BoolArray:

@@ -41,6 +41,7 @@ from factorgraph_dvl.sensors.dvl_water import (
 )
 from factorgraph_dvl.sensors.parameters import SCALAR, XYZ, JointPrior, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    LEAST_VELOCITY_SIGMA,
     ExpectedCorrelation,
     Linearization,
     Motion,
@@ -51,6 +52,7 @@ from factorgraph_dvl.sensors.protocol import (
     Values,
     expected_correlation,
     lever_arm_sigma,
+    velocity_sigma,
 )
 from factorgraph_dvl.sensors.records import (
     check_all_or_none,
@@ -85,10 +87,6 @@ AVERAGING = AVERAGING_SPEC.name
 
 # What a calibration says of the DVL, and not of the sea that day.
 CALIBRATED = (MISALIGNMENT, SCALE_ERROR, LEVER_ARM, BIAS, TIME_OFFSET)
-
-# Least standard deviation, m/s. Chosen: a tenth of the last digit of records; at rest a purely
-# relative model says zero.
-_LEAST_SIGMA = 1e-4
 
 
 class DvlSettings(ClockSection, frozen=True, kw_only=True):
@@ -240,7 +238,7 @@ class Dvl:
         s = self.settings
         speed = np.linalg.norm(self.velocity, axis=1, keepdims=True)
         model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * speed)
-        return np.maximum(np.where(np.isnan(self.std), model, self.std), _LEAST_SIGMA)
+        return np.maximum(np.where(np.isnan(self.std), model, self.std), LEAST_VELOCITY_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return misalignment, scale error, lever arm, bias, clock, current and distortion.
@@ -399,17 +397,22 @@ class DvlVelocity(ObservationByRows):
     clock: Clock = CLOCK
     averaging: str | None = AVERAGING
 
+    @property
+    def noise_by_speed(self) -> tuple[float, float] | None:  # type: ignore[override]
+        """Standard deviation that is constant, m/s, and what grows, over the speed."""
+        grows = min(self.noise) > 0.0 and bool(np.isnan(self.std).all())
+        return self.noise if grows else None
+
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
 
         By the predicted speed: by the measured one, pings whose noise makes them smaller
         would count more, and the scale would come out too small by twice the squared fraction.
         """
-        floor, fraction = self.noise
         predicted = self.residual(motion, values) + self.measured_d
         speed = np.sqrt((predicted * predicted).sum(axis=1, keepdims=True))
-        std = np.where(np.isnan(self.std), np.hypot(floor, fraction * speed), self.std)
-        std = np.maximum(std, _LEAST_SIGMA) * factor
+        own = np.maximum(self.std, LEAST_VELOCITY_SIGMA) * np.atleast_2d(factor)[0]
+        std = np.where(np.isnan(self.std), velocity_sigma(self.noise, speed, factor), own)
         return np.hypot(std, lever_arm_sigma(motion, values[LEVER_ARM])[:, None])
 
     def residual(self, motion: Motion, values: Values) -> Array:

@@ -33,6 +33,7 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
+    LEAST_VELOCITY_SIGMA,
     ExpectedCorrelation,
     Linearization,
     Motion,
@@ -41,6 +42,7 @@ from factorgraph_dvl.sensors.protocol import (
     SensorSection,
     Values,
     lever_arm_sigma,
+    velocity_sigma,
 )
 from factorgraph_dvl.sensors.records import check_range, check_times, named_columns, stack
 from factorgraph_dvl.settings.sections import NonNegative, Sigma3, Vector3
@@ -86,9 +88,6 @@ Acute = Annotated[float, msgspec.Meta(ge=0, le=90)]
 # of a stated direction may differ from 1 by. Chosen: 3 degrees; two digits.
 _LEAST_SPREAD = 0.05
 _UNIT = 0.05
-# Least standard deviation, m/s, as of a DVL; what rounding leaves of a sine. Chosen: far below
-# what is measured.
-_LEAST_SIGMA = 1e-4
 _ROUNDING = 1e-12
 # Signs of x and y in the octants V to VIII, below the plane of x and y.
 _OCTANTS = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
@@ -271,7 +270,7 @@ class DvlBeams:
         """
         s = self.settings
         model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * self.velocity)
-        return np.maximum(model, _LEAST_SIGMA)
+        return np.maximum(model, LEAST_VELOCITY_SIGMA)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return directions or misalignment, scale errors, lever arm, clock and window."""
@@ -442,16 +441,20 @@ class BeamVelocity:
         """Names of directions or misalignment, scale and lever arm."""
         return (*self.geometry.parameters, self.lever_arm)
 
+    @property
+    def noise_by_speed(self) -> tuple[float, float] | None:
+        """Standard deviation that is constant, m/s, and what grows, over the velocity."""
+        return self.noise if min(self.noise) > 0.0 else None
+
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the standard deviations, the gyro's share through the lever arm included.
 
         By the predicted velocity: by the measured one, pings whose noise makes them smaller
         would count more, and the scale would come out too small by twice the squared fraction.
         """
-        floor, fraction = self.noise
         predicted = self.residual(motion, values) + self.measured
-        std = np.maximum(np.hypot(floor, fraction * predicted), _LEAST_SIGMA)
-        std = np.hypot(std * factor, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
+        std = velocity_sigma(self.noise, predicted, factor)
+        std = np.hypot(std, lever_arm_sigma(motion, values[self.lever_arm])[:, None])
         return np.where(self.lost, np.inf, std)
 
     def residual(self, motion: Motion, values: Values) -> Array:

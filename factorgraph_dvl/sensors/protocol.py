@@ -23,6 +23,8 @@ NoiseModel = Literal["estimated", "stated"]
 
 # Derivatives by the motion, as `Linearization` names them.
 _BY_MOTION = ("d_theta", "d_p", "d_v", "d_omega")
+# Least noise of a velocity, m/s. Chosen: below any that is measured.
+LEAST_VELOCITY_SIGMA = 1e-4
 # Correlation time where none is stated, s. Chosen: that of multipath and atmosphere.
 USUAL_CORRELATION_TIME = 100.0
 
@@ -301,11 +303,19 @@ class Observation(Protocol):
     def averages_in_body(self) -> bool:
         """Whether its mean is that of velocities in body axes; else in n."""
 
+    @property
+    def noise_by_speed(self) -> tuple[float, float] | None:
+        """Standard deviation that is constant, m/s, and what grows, over the speed.
+
+        None where noise has not both, or does not follow from them.
+        """
+
     def sigma(self, motion: Motion, values: Values, factor: Array | float = 1.0) -> Array:
         """Return the (M, d) standard deviations of the residual.
 
         Infinite where a component was not measured; its residual need only be finite. A factor,
-        (d,), multiplies the noise of the sensor itself, and not what the gyro adds.
+        (d,), multiplies the noise of the sensor itself, and not what the gyro adds. Where noise
+        grows with speed, it may be (2, d): on the part that is constant, and on what grows.
         """
 
     def residual(self, motion: Motion, values: Values) -> Array:
@@ -328,6 +338,7 @@ class PlainObservation:
     independent: bool = False
     averaging: str | None = None
     averages_in_body: bool = True
+    noise_by_speed: tuple[float, float] | None = None
 
 
 class ObservationByRows(PlainObservation):
@@ -477,6 +488,24 @@ class ClocksAid(Aid, Protocol):
 
     def of_one_clock(self) -> tuple[Aid, ...]:
         """Return what was measured by each of its clocks, itself if it has one."""
+
+
+def velocity_sigma(noise: tuple[float, float], speed: Array, factor: Array | float) -> Array:
+    """Return the standard deviations of velocities whose noise grows with speed, (M, d), m/s.
+
+    Parameters
+    ----------
+    noise : tuple of (float, float)
+        Floor, m/s, and fraction of the speed.
+    speed : ndarray, shape (M, 1) or (M, d), m/s
+        Speeds.
+    factor : ndarray, shape (d,) or (2, d), or float
+        Factors on both parts, or on each.
+    """
+    by_part = np.asarray(factor)
+    floor, growth = by_part if by_part.ndim == 2 else (by_part, by_part)
+    std = np.hypot(noise[0] * floor, noise[1] * growth * speed)
+    return np.asarray(np.maximum(std, LEAST_VELOCITY_SIGMA * floor))
 
 
 def lever_arm_sigma(motion: Motion, lever_arm: Array) -> Array:

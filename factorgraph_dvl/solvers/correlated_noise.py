@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from factorgraph_dvl.estimates import Noise, noise_name
+from factorgraph_dvl.estimates import Noise, NoiseBySpeed, noise_name
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.graph.processes import Process, node_times, walk_sigma, walk_time
@@ -405,5 +405,16 @@ def noise_of(problem: Problem) -> tuple[Noise, ...]:
                 factor = join(white, share)
                 time = np.where(process.sigma > 0.0, process.tau, np.nan)
                 std = process.sigma
-        out.append(Noise(noise_name(o.label), factor, time, std))
+        by_speed = _by_speed(problem, o)
+        out.append(Noise(noise_name(o.label), factor, time, std, by_speed))
     return tuple(out)
+
+
+def _by_speed(problem: Problem, o: Observation) -> NoiseBySpeed | None:
+    """Return both parts of the noise of a velocity log, None where they are as stated."""
+    growth = problem.noise_growth.get(o.label)
+    if growth is None or o.noise_by_speed is None:
+        return None
+    factor = float(np.sqrt(np.mean(problem.noise_factors[o.label] ** 2)))
+    std, fraction = o.noise_by_speed
+    return NoiseBySpeed(factor * growth[0] * std, factor * growth[1] * fraction, std, fraction)

@@ -541,6 +541,7 @@ def with_parameters(
     )
     test.reject(problem.rejected)
     test.noise_factors = problem.noise_factors
+    test.noise_growth = problem.noise_growth
     test.robust_weights = robust
     test.long_run = problem.long_run
     if block is None:

@@ -97,6 +97,7 @@ def _rough_minima(
         tilt=first.problem.tilt,
     )
     problem.noise_factors = first.problem.noise_factors
+    problem.noise_growth = first.problem.noise_growth
     problem.robust_weights = first.problem.robust_weights
     rotations = {p.name for p in problem.parameters if p.rotation}
     mountings = prepared.mountings_at(chain, states)

@@ -57,6 +57,8 @@ class Model:
         Correlated errors, and those that the trial states.
     noise_factors : mapping of str to ndarray
         Factors (d,) of each label on stated standard deviations.
+    noise_growth : mapping of str to ndarray
+        Factors (2,) of each label on what of its noise is constant, and on what grows with speed.
     long_run : mapping of str to ndarray
         Factors (d,) of each label for noise that persists for some measurements.
     gain : float, default 0
@@ -81,6 +83,7 @@ class Model:
     processes: tuple[Process, ...] = ()
     stated_processes: tuple[Process, ...] = ()
     noise_factors: Mapping[str, Array] = field(default_factory=dict)
+    noise_growth: Mapping[str, Array] = field(default_factory=dict)
     long_run: Mapping[str, Array] = field(default_factory=dict)
     gain: float = 0.0
     robust_weights: Mapping[str, Array] = field(default_factory=dict)
@@ -95,6 +98,7 @@ class Model:
             self,
             processes=self.stated_processes,
             noise_factors={label: np.ones(f.size) for label, f in self.noise_factors.items()},
+            noise_growth={},
             long_run={},
             gain=0.0,
             robust_weights={},
@@ -117,7 +121,7 @@ class Model:
     def applied(self, problem: Problem) -> None:
         """Make a problem that is laid out as this model have its weights."""
         problem.processes = self.processes
-        problem.noise_factors = self.noise_factors
+        problem.noise_factors, problem.noise_growth = self.noise_factors, self.noise_growth
         problem.long_run, problem.gain = self.long_run, self.gain
         problem.robust_weights = self.robust_weights
         states, values = self.reference
@@ -129,6 +133,7 @@ class Model:
         return (
             problem.processes is self.processes
             and problem.noise_factors is self.noise_factors
+            and problem.noise_growth is self.noise_growth
             and problem.long_run is self.long_run
             and problem.robust_weights is self.robust_weights
         )

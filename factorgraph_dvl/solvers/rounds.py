@@ -46,6 +46,7 @@ from factorgraph_dvl.solvers.steps import (
     KnownParametersAgain,
     MotionStrengths,
     Noise,
+    NoiseGrowth,
     Proposal,
     ScaleWalks,
     States,
@@ -127,7 +128,7 @@ def settle(
     walks = Walks(report, known)
     steps: list[Step] = [
         MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(),
-        ScaleWalks(), known, ChangedScales(), Noise(), ImuNoise(), Uncorrelated(),
+        ScaleWalks(), known, ChangedScales(), Noise(), NoiseGrowth(), ImuNoise(), Uncorrelated(),
         KnownParametersAgain(known), walks,
     ]  # fmt: skip
     if roughly:

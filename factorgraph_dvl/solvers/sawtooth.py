@@ -7,8 +7,8 @@ near the period; folded by a period P, s and w show the sawtooth g with the high
 
     (Σ s g)² / Σ w g²,    g = (t - start) / P mod 1, less its weighted mean.
 
-What is left of s without it says how noise scatters: a delay itself has lines everywhere, where the
-vehicle sways.
+What is left of s without it says how noise scatters: where the vehicle sways, a delay itself has
+lines everywhere.
 """
 
 from __future__ import annotations

@@ -34,6 +34,7 @@ from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, i
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model, linear_objective
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
+from factorgraph_dvl.solvers.noise_growth import growths
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
@@ -521,6 +522,28 @@ class Noise:
             yield _from(at, noise_factors=changed, processes=closer)
 
 
+class NoiseGrowth:
+    """Noise of velocity logs: what of it is constant, and what grows with speed."""
+
+    name = "noise by speed"
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield the parts that residuals ask for, of each log."""
+        if at.problem.chain.interpolates or not at.minimum.converged:
+            return
+        model = at.model
+        for label, growth, change, _ in list(growths(at.problem, at.minimum.evaluation)):
+            proposal = _from(
+                at,
+                noise_growth={**model.noise_growth, label: growth},
+                noise_factors={
+                    **model.noise_factors,
+                    label: model.noise_factors[label] * change,
+                },
+            )
+            yield replace(proposal, price=float(np.log(at.problem.used_count)))
+
+
 class ImuNoise:
     """Noise of gyros and accelerometers of a record that is noisier than stated."""
 
@@ -569,12 +592,12 @@ class Walks:
         if imu.prior is not None and not _misfit(at.problem):
             return
         self._tried = True
-        # A walk explains what is beyond the noise that is stated.
-        noise = {label: np.minimum(f, 1.0) for label, f in at.model.noise_factors.items()}
         first = self.known.first
         if first is not None and (self.known.freed or _labels(at.model) != _labels(first.model)):
             # Lasting noise or a freed parameter may have taken the place of a walk.
             at = _applied(first)
+        # A walk explains what is beyond the noise that is stated.
+        noise = {label: np.minimum(f, 1.0) for label, f in at.model.noise_factors.items()}
         model, prepared = at.model, at.model.prepared
         assert isinstance(prepared, Preparation)
         found = bias_walks(prepared, at.problem, at.minimum, noise, self.report)

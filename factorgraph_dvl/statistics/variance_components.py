@@ -13,9 +13,10 @@ from factorgraph_dvl.sensors.protocol import Observation
 from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
-# Standard deviation of the logarithm of a factor before any data, as degrees of freedom at
-# factor 1: 1 / (2 ln² 3). Chosen: data sheets are right within a factor of three.
-_PRIOR_FREEDOM = 1.0 / (2.0 * np.log(3.0) ** 2)
+# Standard deviation of the logarithm of a factor before any data. Chosen: data sheets are right
+# within a factor of three. As degrees of freedom at factor 1:
+PRIOR_LOG_STD = float(np.log(3.0))
+_PRIOR_FREEDOM = 1.0 / (2.0 * PRIOR_LOG_STD**2)
 # Factor below which a stated standard deviation stays as it is. Chosen: residuals ten times
 # smaller are those of a record that was smoothed, or simulated without noise, and say nothing
 # of its error.

@@ -91,6 +91,42 @@ def test_a_lost_beam_does_not_take_the_others_along():
     assert missing(out, ["beam1_m_s"]) == []
 
 
+@pytest.mark.parametrize("times", [2, 5])
+def test_values_that_a_faster_log_writes_again_are_missing(times):
+    table = dvl_table()
+    table |= {name: np.repeat(table[name], times)[:200] for name in VELOCITY_COLUMNS}
+    out, (finding,) = without_invalid_values("dvl", table, "dvl.csv")
+    assert missing(out) == [i for i in range(200) if i % times]
+    assert f"{200 - 200 // times} that repeat" in finding.text
+    assert "faster than the instrument" in finding.text
+
+
+def test_a_log_at_5_hz_of_an_instrument_at_4_is_faster_too():
+    table = dvl_table()
+    rows = np.arange(200) * 4 // 5
+    table |= {name: table[name][rows] for name in VELOCITY_COLUMNS}
+    out, _ = without_invalid_values("dvl", table, "dvl.csv")
+    assert missing(out) == np.flatnonzero(np.diff(rows, prepend=-1) == 0).tolist()
+
+
+def test_fixes_that_a_faster_log_writes_again_are_missing_and_one_held_at_rest_is_not():
+    time = np.arange(300) * 0.2
+    since = np.floor(time)
+    table = {"time_s": time, "lat_deg": 36.0 + 2e-5 * since, "lon_deg": 121.0 + 0.0 * since}
+    table["height_m"] = 10.0 + 0.1 * np.sin(since)
+    out, (finding,) = without_invalid_values("gnss", table, "gnss.csv")
+    assert (
+        missing(out, POSITION_COLUMNS) == np.flatnonzero(np.diff(since, prepend=-1) == 0).tolist()
+    )
+    assert "240 that repeat" in finding.text
+    rest = {
+        n: np.where(time > 30.0, v[-1], 1.0 * np.round(v + 1e-5 * time, 9))
+        for n, v in table.items()
+    }
+    rest["time_s"] = time
+    assert without_invalid_values("gnss", rest, "gnss.csv")[1] == []
+
+
 def test_fixes_at_zero_and_frozen_fixes_are_missing():
     time = np.arange(100) * 1.0
     table = {"time_s": time, "lat_deg": 36.0 + 2e-5 * time, "lon_deg": 121.0 + 0.0 * time}

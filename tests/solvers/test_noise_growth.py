@@ -1,0 +1,85 @@
+"""Noise of a velocity log that is constant, and that grows with speed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from monte_carlo import RUNS, nees_of
+from scipy.stats import chi2
+from truth import CONFIGS
+
+from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.sensors.protocol import velocity_sigma
+from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.solvers.batch import solve, solve_with_problem, solved_problems
+from factorgraph_dvl.solvers.noise_growth import growths
+
+# Noise of the DVL, beside 1 mm/s and 0.2 % of the speed as stated.
+NOISE = 0.008
+
+
+def trial_of(seed, std=NOISE):
+    """Return a quarter of an hour of the cruise, with more noise that is constant."""
+    plan = yaml.safe_load((CONFIGS / "cruise.yaml").read_text(encoding="utf-8"))
+    plan["manoeuvres"][2]["repeat"] = 1
+    trial = simulate(parse_scenario(plan), seed)
+    noise = std * np.random.default_rng(seed + 100).standard_normal(trial.dvl.velocity.shape)
+    return replace(trial, dvl=replace(trial.dvl, velocity=trial.dvl.velocity + noise))
+
+
+def test_both_parts_of_the_noise_add_up_by_hand():
+    """Of 3 mm/s and 0.2 % at 2 m/s: √(3² + 4²) mm/s; doubled parts √(6² + 4²) and √(3² + 8²)."""
+    noise, speed = (0.003, 0.002), np.array([[2.0]])
+    assert velocity_sigma(noise, speed, 1.0) == pytest.approx(0.005)
+    assert velocity_sigma(noise, speed, np.array([2.0, 3.0])).ravel() == pytest.approx(
+        [0.010, 0.015]
+    )
+    parts = np.array([[2.0, 1.0], [1.0, 2.0]])
+    expected = np.sqrt([36.0 + 16.0, 9.0 + 64.0]) / 1e3
+    assert velocity_sigma(noise, speed, parts).ravel() == pytest.approx(expected)
+
+
+def test_noise_at_rest_is_as_small_as_any_measured():
+    assert velocity_sigma((0.0, 0.002), np.zeros((1, 1)), 1.0) == pytest.approx(1e-4)
+
+
+def test_noise_as_stated_has_its_parts():
+    (solved, *_) = solved_problems(trial_of(0, std=0.0))
+    assert solved.problem.noise_growth == {}
+    assert list(growths(solved.problem, solved.minimum.evaluation)) == []
+
+
+def test_a_constant_part_that_is_larger_is_found_and_named():
+    solution, solved = solve_with_problem(trial_of(0), rate_hz=1.0)
+    (noise,) = [n for n in solution.noise if n.name == "dvl_velocity"]
+    assert noise.by_speed.std == pytest.approx(np.hypot(NOISE, 0.001), rel=0.05)
+    assert noise.by_speed.fraction == pytest.approx(0.002, rel=0.1)
+    (reason,) = solution.verdict.reasons
+    assert (reason.code, reason.sensor) == (Code.LARGE_RESIDUALS, "DVL velocity")
+    assert f"enter velocity_std_m_s: {noise.by_speed.std:.2g} and" in reason.text
+
+    problem, evaluation = solved.problem, solved.minimum.evaluation
+    (i,) = (i for i, o in enumerate(problem.observations) if o.label == "DVL velocity")
+    growth = problem.noise_growth
+    assert growth["DVL velocity"][0] > 2.0 > 1.0 > growth["DVL velocity"][1]
+    # It is found once, and is one on average.
+    assert list(growths(problem, evaluation)) == []
+    now = problem.sigma(evaluation)[i]
+    problem.noise_growth = {}
+    ratio = now / problem.sigma(evaluation)[i]
+    assert np.mean(ratio[np.isfinite(ratio)] ** 2) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.slow
+def test_standard_deviations_hold():
+    squares = []
+    for seed in range(RUNS):
+        trial = trial_of(seed)
+        solution = solve(trial, rate_hz=1.0)
+        assert solution.verdict.grade == "doubtful"
+        squares.append(nees_of(solution, trial))
+    low, high = chi2.ppf([0.005, 0.995], 7 * RUNS)
+    assert low < sum(squares) < high, np.round(np.array(squares) / 7, 2)
