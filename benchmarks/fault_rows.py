@@ -67,7 +67,9 @@ def clock(section: str, kind: str) -> tuple[str, ...]:
         freed = rf"^(estimated_instead|unexplained_misfit)[^:]*{section}_clock_rate"
         return (rf"^clock_drift {sensor}", freed)
     if kind == "step":
-        return (rf"^clock_step {sensor}", r"^changed_along_trial[^:]*time_offset")
+        # With measurements before and after alone, a clock that drifts by as much is the same.
+        drifts = rf"^estimated_instead.*{section}_clock_rate"
+        return (rf"^clock_step {sensor}", r"^changed_along_trial[^:]*time_offset", drifts)
     return (rf"^(clock_offset|leap_seconds|local_time|no_overlap) {sensor}", freed)
 
 
@@ -453,6 +455,34 @@ ROWS = (
         (0.002, 0.01),
         lambda x: [g.truncated("dvl", x)],
         (gross("DVL"), r"dvl_truncation"),
+    ),
+    Row(
+        "IMU: a gyro bias changes at once",
+        "deg/h",
+        (0.5, 5.0),
+        lambda x: [f.imu_bias_step((x, 0.0, 0.0), (0.0, 0.0, 0.0), 0.4)],
+        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*gyro_bias",),
+    ),
+    Row(
+        "IMU: an accelerometer bias changes at once",
+        "µg",
+        (100.0, 1000.0),
+        lambda x: [f.imu_bias_step((0.0, 0.0, 0.0), (x, 0.0, 0.0), 0.4)],
+        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*accel_bias",),
+    ),
+    Row(
+        "DVL: constant noise",
+        "m/s",
+        (0.004, 0.01),
+        lambda x: [g.dvl_noise(x)],
+        (r"^(large_residuals|noise)\w* DVL",),
+    ),
+    Row(
+        "DVL: values written again",
+        "times",
+        (2, 5),
+        lambda x: [g.written_again("dvl", x)],
+        (r"^invalid_values DVL",),
     ),
     Row("DVL: averages", "s", (1.0, 3.0), lambda x: [g.dvl_averages(x)], (r"averaging",)),
     Row(

@@ -425,6 +425,28 @@ def imu_bias_walk(gyro_deg_h_sqrt_h: float, accel_ug_sqrt_h: float = 0.0) -> Fau
     return fault
 
 
+def imu_bias_step(
+    gyro_deg_h: Sequence[float], accel_ug: Sequence[float], share: float = 0.5
+) -> Fault:
+    """Change the biases of the IMU at once, after a share of the trial."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        imu = trial.inertial
+        after = (imu.time > imu.time[0] + share * np.ptp(imu.time))[:, None]
+        # The truth of a bias that changes is its mean.
+        mean = float(after.mean())
+        trial = with_truth(trial, "gyro_bias_deg_h", mean * np.asarray(gyro_deg_h))
+        trial = with_truth(trial, "accel_bias_ug", mean * np.asarray(accel_ug))
+        return with_arrays(
+            trial,
+            "imu",
+            gyro=imu.gyro + DEG_PER_HOUR * after * np.asarray(gyro_deg_h),
+            accel=imu.accel + MICRO_G * after * np.asarray(accel_ug),
+        )
+
+    return fault
+
+
 def imu_spikes(share: float, gyro_rad_s: float = 1.0, accel_m_s2: float = 10.0) -> Fault:
     """Add spikes of a size, in random directions, to a share of the samples of the IMU."""
 

@@ -153,6 +153,29 @@ def truncated(section: str, step: float, field: str = "velocity") -> Fault:
     return fault
 
 
+def dvl_noise(std_m_s: float) -> Fault:
+    """Add white noise to the velocities of the DVL that is the same at any speed."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        velocity = record_of(trial, "dvl").velocity
+        return with_arrays(
+            trial, "dvl", velocity=velocity + std_m_s * rng.standard_normal(velocity.shape)
+        )
+
+    return fault
+
+
+def written_again(section: str, times: int, field: str = "velocity") -> Fault:
+    """Let a record have each of its values several times, as of a log that is faster."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        values = getattr(record_of(trial, section), field)
+        last = np.arange(len(values)) // times * times
+        return with_arrays(trial, section, **{field: values[last]})
+
+    return fault
+
+
 def _along(trial: Trial, time: Array, values: Array) -> Array:
     """Return values of the reference at other times."""
     return np.interp(time, _reference(trial).time, values)

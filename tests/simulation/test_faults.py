@@ -228,3 +228,17 @@ def test_spikes_hit_a_share_of_the_samples(trial):
 def test_settings_are_misstated(trial):
     assert one(trial, faults.sampling_misstated()).imu.settings.sampling == "instantaneous"
     assert one(trial, faults.body_axes_misstated("FLU")).body_axes == "FLU"
+
+
+def test_biases_change_at_once_and_their_truth_is_the_mean(trial):
+    changed = one(trial, faults.imu_bias_step((3.6, 0.0, 0.0), (0.0, 0.0, 1000.0), 0.25))
+    gyro = changed.imu.gyro - trial.imu.gyro
+    accel = changed.imu.accel - trial.imu.accel
+    quarter = len(gyro) // 4
+    np.testing.assert_allclose(gyro[[0, quarter - 2]], 0.0, atol=1e-15)
+    np.testing.assert_allclose(gyro[[quarter + 2, -1], 0], np.radians(0.001), rtol=1e-6)
+    np.testing.assert_allclose(accel[-1], [0.0, 0.0, 0.00980665], atol=1e-9)
+    moved = (
+        changed.calibration_truth["gyro_bias_deg_h"] - trial.calibration_truth["gyro_bias_deg_h"]
+    )
+    np.testing.assert_allclose(moved, [2.7, 0.0, 0.0], rtol=0.01)

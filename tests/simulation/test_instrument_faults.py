@@ -105,3 +105,15 @@ def test_a_current_is_there_all_the_time(trial):
     change = made.dvl.velocity - still.dvl.velocity
     expected = np.tile([0.0, -0.1, 0.0], (len(change), 1))
     np.testing.assert_allclose(change, expected, atol=1e-12)
+
+
+def test_noise_of_the_dvl_is_the_same_at_any_speed(trial):
+    noisy = with_faults(trial, [g.dvl_noise(0.01)])
+    added = noisy.dvl.velocity - trial.dvl.velocity
+    np.testing.assert_allclose(np.nanstd(added, axis=0), 0.01, rtol=0.2)
+
+
+def test_values_are_written_again(trial):
+    again = with_faults(trial, [g.written_again("dvl", 3)])
+    np.testing.assert_array_equal(again.dvl.velocity[:7:3], trial.dvl.velocity[:7:3])
+    np.testing.assert_array_equal(again.dvl.velocity[3:6], trial.dvl.velocity[[3, 3, 3]])
