@@ -461,14 +461,14 @@ ROWS = (
         "deg/h",
         (0.5, 5.0),
         lambda x: [f.imu_bias_step((x, 0.0, 0.0), (0.0, 0.0, 0.0), 0.4)],
-        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*gyro_bias",),
+        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*(gyro|accel)_bias",),
     ),
     Row(
         "IMU: an accelerometer bias changes at once",
         "µg",
         (100.0, 1000.0),
         lambda x: [f.imu_bias_step((0.0, 0.0, 0.0), (x, 0.0, 0.0), 0.4)],
-        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*accel_bias",),
+        (r"^(changed_along_trial|estimated_instead|far_from_prior)[^:]*(gyro|accel)_bias",),
     ),
     Row(
         "DVL: constant noise",

@@ -95,7 +95,7 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     least = 1.0 if factor is None else float(np.nanmin(factor))
     small = least < NOISE_FACTORS[0]
     if noise is not None and noise.by_speed is not None and rms <= DO_NOT_FIT:
-        return [_by_speed(r.label, noise.by_speed)]
+        return [_by_speed(r.label, noise.by_speed, least)]
     if rms <= TOO_LARGE:
         text = message("small_residuals.noise", ratio=least)
         return [Finding(Code.SMALL_RESIDUALS, text, sensor=r.label)] if small else []
@@ -122,10 +122,11 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     return [Finding(code, text, sensor=r.label, severity=severity)]
 
 
-def _by_speed(label: str, noise: NoiseBySpeed) -> Finding:
-    """Return what the noise of a velocity log is."""
-    factors = noise.std / noise.stated_std, noise.fraction / noise.stated_fraction
-    allowed = NOISE_FACTORS[0] <= min(factors) and max(factors) <= NOISE_FACTORS[1]
+def _by_speed(label: str, noise: NoiseBySpeed, least: float) -> Finding:
+    """Return what the noise of a velocity log is, `least` being the least factor on all of it."""
+    most = max(noise.std / noise.stated_std, noise.fraction / noise.stated_fraction)
+    # A part that is smaller than stated makes nothing too certain.
+    allowed = NOISE_FACTORS[0] <= least and most <= NOISE_FACTORS[1]
     text = message(
         "large_residuals.by_speed",
         std=noise.std,
