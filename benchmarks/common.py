@@ -188,7 +188,7 @@ def objective_again(problem: Problem, evaluation: Evaluation) -> float:
         processes=problem.processes,
     )
     again.reject(problem.rejected)
-    again.noise_factors = problem.noise_factors
+    again.noise_factors, again.noise_growth = problem.noise_factors, problem.noise_growth
     again.long_run, again.gain = problem.long_run, problem.gain
     again.robust_weights = problem.robust_weights
     for bound, weight in zip(again.bound, problem.weights, strict=True):

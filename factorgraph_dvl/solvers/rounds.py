@@ -127,7 +127,7 @@ def settle(
     known = KnownParameters(at)
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Averaging(), Gates(), GrossErrors(), Correlation(),
+        MotionStrengths(), States(), Averaging(), Gates(), walks, GrossErrors(), Correlation(),
         ScaleWalks(), known, ChangedScales(), Noise(), NoiseGrowth(), ImuNoise(), Uncorrelated(),
         KnownParametersAgain(known), walks,
     ]  # fmt: skip

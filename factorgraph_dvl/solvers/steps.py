@@ -18,6 +18,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
 from factorgraph_dvl.quality.finding import Finding
 from factorgraph_dvl.quality.results import DO_NOT_FIT
+from factorgraph_dvl.sensors.imu import BIASES
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
@@ -47,6 +48,9 @@ _SHARES = (1.0, 0.5, 0.25, 0.125)
 _FURTHER = 3.0
 # Most parameters that are estimated although stated as known. Chosen: more make a wrong model.
 _MOST_FREED = 2
+# Squares of residuals beyond noise, over it, that are a large misfit. Chosen: noise is twice that
+# stated. Share of it that a bias must explain. Chosen: elsewhere, the mounting follows a part.
+_LARGE_MISFIT, _SHARE_OF_MISFIT = 3.0, 0.2
 # Variance of the scores, beside that of white noise, that a change may leave to explain what looks
 # like correlated noise. Measured: 8 where a mount slipped, 600 where samples were misstated.
 _MOST_SCATTER = 20.0
@@ -585,6 +589,9 @@ class Walks:
         prepared = at.model.prepared
         if self._tried or not isinstance(prepared, Preparation) or self.known.left is not None:
             return
+        # Before parameters are tested, only what explains more of a large misfit than others.
+        if not (np.isfinite(self.known.tested_at) or _biases_explain_more(at)):
+            return
         imu = prepared.trial.inertial
         if not prepared.trial.estimates_noise(imu):
             return
@@ -663,6 +670,19 @@ def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bo
         return False
     most = max(found, key=lambda c: c.fall)
     return max(c.chi2 for c in found) > gain or gain < most.fall < _MOST_SCATTER * most.chi2
+
+
+def _biases_explain_more(at: Estimated) -> bool:
+    """Whether a bias of the IMU that changes once explains more of a large misfit than others."""
+    evaluation, count = at.minimum.evaluation, at.problem.used_count
+    misfit = 2.0 * evaluation.cost - count
+    if not (at.minimum.converged and misfit > _LARGE_MISFIT * count):
+        return False
+    found = changes_at(at.problem, at.minimum)
+    most = max(found, key=lambda t: t.change.fall, default=None)
+    if most is None or most.parameter.name not in BIASES:
+        return False
+    return most.change.fall > _SHARE_OF_MISFIT * misfit
 
 
 def _misfit(problem: Problem) -> bool:

@@ -10,6 +10,7 @@ import yaml
 from msgspec import structs
 from truth import CONFIGS, LONGER_TURNS_AND_BRAKING, merged, scenario
 
+from factorgraph_dvl.analysis.error_statistics import trajectory_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
@@ -98,3 +99,17 @@ def test_motion_is_within_its_standard_deviations_with_any_walk(walk):
     solution = solve(faults.with_faults(trial, [faults.imu_bias_walk(*walk)], 0), rate_hz=1.0)
     assert len(of_walks(solution)) == sum(w > 0.0 for w in walk)
     assert np.abs(errors(solution, trial)).max() < 4.0
+
+
+def test_a_bias_that_changes_at_once_is_a_walk_before_anything_else():
+    """It took the place of noise that persists, of gross errors and of noise of every sensor."""
+    plan = yaml.safe_load((CONFIGS / "seed-a-phase-90.yaml").read_text(encoding="utf-8"))
+    trial = simulate(parse_scenario(plan), 0)
+    fault = faults.imu_bias_step((5.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.4)
+    solution = solve(faults.with_faults(trial, [fault]), rate_hz=1.0)
+    assert [step.change for step in solution.steps][:2] == ["start", "walks of biases"]
+    assert solution.verdict.grade == "doubtful"
+    first = solution.verdict.reasons[0]
+    assert (first.code, first.parameter) == (Code.ESTIMATED_INSTEAD, "gyro_bias_deg_h")
+    motion = trajectory_errors(solution, trial.reference)
+    assert np.abs(motion.attitude.normalised).max() < 5.0
