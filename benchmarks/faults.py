@@ -4,7 +4,7 @@
 
 writes `faults.md` into out/benchmarks, or with `--out docs` that of the documentation. Each run
 has a process of its own, and a file in the cache (out/benchmarks/faults): a run that is there is
-not made again.
+not made again. Faults that took longer than 15 s of CPU are made with the first seed alone.
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,12 @@ from factorgraph_dvl.trial import Trial
 PAGE = "faults.md"
 # A run that takes longer, s, has hung.
 LONGEST_S = 900.0
+# CPU, s, up to which a fault is made with every seed.
+ONCE_S = 15.0
 # Errors, in standard deviations, and noncentrality, from which on a fault must be seen.
 LARGE, SEEN = 5.0, 30.0
+# Difference of objectives that is none.
+SAME = 0.1
 # Time between two looks at the processes, s: a run takes longer.
 LOOK_S = 0.2
 
@@ -145,6 +150,7 @@ def _write(run: Run, path: Path) -> None:
         result = outcome(run)
     except Exception:
         result = {"grade": "crashed", "reason": traceback.format_exc().strip()[-800:]}
+    result["commit"] = common.commit()
     path.write_text(json.dumps(result), encoding="utf-8")
 
 
@@ -177,6 +183,12 @@ def file_of(run: Run, cache: Path) -> Path:
     return cache / f"{run.key}.json"
 
 
+def _is_short(run: Run, cache: Path) -> bool:
+    """Whether the same with the first seed took little time."""
+    first = json.loads(file_of(replace(run, seed=0), cache).read_text("utf-8"))
+    return run.row is None or not first.get("cpu_s", 0.0) > ONCE_S
+
+
 def worst(found: dict[str, Any]) -> float:
     """Return the largest error of a result, in standard deviations."""
     return float(max(found.get(name, np.nan) for name in ("calibration", "position", "attitude")))
@@ -197,7 +209,8 @@ INTRODUCTION = """\
 
 Each row is a fault that a simulated trial has on top of its honest errors, solved from its files
 as its user would. Where no key says otherwise, clocks, antenna and DVL bias are estimated.
-*Error* is the largest one over calibration, position and attitude, in standard deviations.
+*Error* is the largest one over calibration, position and attitude, in standard deviations, and
+over seeds. A fault that took longer than 15 s of CPU is made with one seed.
 Position and attitude count every second, so 4 is chance. λ is the noncentrality of the fault:
 twice the cost that it adds at the minimum with noise as stated. *Named* says whether the first
 reason is the true cause. λ is worked out for results that are graded good, and is negative where
@@ -238,39 +251,75 @@ def summary(faulty: Sequence[tuple[Run, dict[str, Any], float]]) -> list[str]:
         f"{len(silent)} with an error above {LARGE:g} σ are graded good, {len(seen)} of them with "
         f"λ of {SEEN:g} or more. {len(crashed)} crashed.",
         "",
+        *_commits([x[1] for x in faulty]),
         *_objectives([x[1] for x in faulty if "again" in x[1]]),
     ]
+
+
+def _commits(found: Sequence[dict[str, Any]]) -> list[str]:
+    """Return which code made the runs, where it was not the same for all."""
+    counts = Counter(each.get("commit", "an earlier commit") for each in found)
+    if len(counts) < 2:
+        return []
+    each = ", ".join(f"{count} are of {commit}" for commit, count in counts.most_common())
+    return [f"The runs were made by several commits: {each}.", ""]
 
 
 def _objectives(found: Sequence[dict[str, Any]]) -> list[str]:
     """Return what is said of the records of steps."""
     rises = sum(each["rises"] for each in found)
-    most = max((abs(each["again"]) for each in found), default=0.0)
+    same = sum(abs(each["again"]) < SAME for each in found)
     return [
         f"The objective rises from one step to the next {rises} times in the {len(found)} runs "
         "that are solved. A problem made anew, eliminated in another order, has the same "
-        f"objective at the end within {most:.2g}.",
+        f"objective at the end within {SAME:g} in {same}; in the others it fits nothing.",
     ]
 
 
 def table(faulty: Iterable[tuple[Run, dict[str, Any], float]]) -> list[str]:
-    """Return the table of all runs."""
+    """Return the table of all faults, each with its seeds."""
     out = [
-        "| scenario | fault | level | error, σ | λ | verdict | first reason | named |",
-        "|---|---|---|---:|---:|---|---|---|",
+        "| scenario | fault | level | seeds | error, σ | λ | verdict | first reason | named |",
+        "|---|---|---|---:|---:|---:|---|---|---|",
     ]
-    for run, found, added in faulty:
-        assert run.row is not None
-        reason = found["reason"].split(":")[0].strip() if found["grade"] != "refused" else "–"
-        named = "" if found["grade"] == "good" else ("yes" if is_named(run, found) else "no")
-        level = ", ".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in _levels(run))
-        lam = "–" if np.isnan(added) else f"{round(added)}"
-        size = "–" if np.isnan(worst(found)) else f"{worst(found):.2g}"
+    groups: dict[tuple[str, str], list[tuple[Run, dict[str, Any], float]]] = {}
+    for each in faulty:
+        groups.setdefault((each[0].scenario, _fault(each[0])), []).append(each)
+    for (scenario, fault), every in groups.items():
+        errors = [worst(found) for _, found, _ in every]
+        graded = [(run, found) for run, found, _ in every if found["grade"] != "good"]
+        named = sum(is_named(run, found) for run, found in graded)
+        verdicts = Counter(found["grade"] for _, found, _ in every).most_common()
+        reasons = Counter(
+            "–" if found["grade"] == "refused" else found["reason"].split(":")[0].strip()
+            for _, found in graded
+        ).most_common()
         out.append(
-            f"| {run.scenario} | {run.row.name} | {level} {run.row.unit} | {size} "
-            f"| {lam} | {found['grade']} | {reason} | {named} |"
+            f"| {scenario} | {fault} | {len(every)} | {_largest(errors, '.2g')} "
+            f"| {_largest([added for _, _, added in every], '.0f')} | {_counted(verdicts)} "
+            f"| {_counted(reasons)} | {f'{named} of {len(graded)}' if graded else ''} |"
         )
     return out
+
+
+def _fault(run: Run) -> str:
+    """Return the fault and the level of a run, as two cells."""
+    assert run.row is not None
+    level = ", ".join(f"{x:.3g}" if isinstance(x, float) else str(x) for x in _levels(run))
+    return f"{run.row.name} | {level} {run.row.unit}"
+
+
+def _largest(values: Sequence[float], digits: str) -> str:
+    """Return the largest of values that are known."""
+    known = [value for value in values if not np.isnan(value)]
+    return f"{max(known):{digits}}" if known else "–"
+
+
+def _counted(counts: Sequence[tuple[str, int]]) -> str:
+    """Return words with how often each is there, where they are several."""
+    if len(counts) == 1:
+        return counts[0][0]
+    return ", ".join(f"{word} ({count})" for word, count in counts)
 
 
 def _levels(run: Run) -> tuple[Any, ...]:
@@ -302,6 +351,8 @@ def main() -> None:
     runs = [r for r in all_runs(args.seeds) if r.row is None or re.search(args.only, r.key)]
     wanted = {(r.scenario, r.seed) for r in runs if r.row is not None}
     runs = [r for r in runs if (r.scenario, r.seed) in wanted]
+    make([run for run in runs if run.seed == 0], args)
+    runs = [run for run in runs if run.seed == 0 or _is_short(run, args.cache)]
     make(runs, args)
     found = [(run, json.loads(file_of(run, args.cache).read_text("utf-8"))) for run in runs]
     print(common.write_page(args.out / PAGE, page(args.origin, found)))
