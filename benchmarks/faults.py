@@ -272,7 +272,7 @@ def _objectives(found: Sequence[dict[str, Any]]) -> list[str]:
     return [
         f"The objective rises from one step to the next {rises} times in the {len(found)} runs "
         "that are solved. A problem made anew, eliminated in another order, has the same "
-        f"objective at the end within {SAME:g} in {same}; in the others it fits nothing.",
+        f"objective at the end within {SAME:g} in {same}.",
     ]
 
 
