@@ -95,7 +95,8 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     least = 1.0 if factor is None else float(np.nanmin(factor))
     small = least < NOISE_FACTORS[0]
     if noise is not None and noise.by_speed is not None and rms <= DO_NOT_FIT:
-        return [_by_speed(r.label, noise.by_speed, least)]
+        usual = not small and bool(np.nanmax(noise.factor) <= NOISE_FACTORS[1])
+        return [_by_speed(r.label, noise.by_speed, usual=usual)]
     if rms <= TOO_LARGE:
         text = message("small_residuals.noise", ratio=least)
         return [Finding(Code.SMALL_RESIDUALS, text, sensor=r.label)] if small else []
@@ -122,11 +123,8 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     return [Finding(code, text, sensor=r.label, severity=severity)]
 
 
-def _by_speed(label: str, noise: NoiseBySpeed, least: float) -> Finding:
-    """Return what the noise of a velocity log is, `least` being the least factor on all of it."""
-    most = max(noise.std / noise.stated_std, noise.fraction / noise.stated_fraction)
-    # A part that is smaller than stated makes nothing too certain.
-    allowed = NOISE_FACTORS[0] <= least and most <= NOISE_FACTORS[1]
+def _by_speed(label: str, noise: NoiseBySpeed, *, usual: bool) -> Finding:
+    """Return what the noise of a velocity log is, and whether all of it is as data sheets are."""
     text = message(
         "large_residuals.by_speed",
         std=noise.std,
@@ -134,8 +132,10 @@ def _by_speed(label: str, noise: NoiseBySpeed, least: float) -> Finding:
         stated_std=noise.stated_std,
         stated_fraction=noise.stated_fraction,
     )
-    severity: Severity = "note" if allowed else "warning"
-    return Finding(Code.LARGE_RESIDUALS, text, sensor=label, severity=severity)
+    severity: Severity = "note" if usual else "warning"
+    larger = noise.std > noise.stated_std or noise.fraction > noise.stated_fraction
+    code = Code.LARGE_RESIDUALS if larger else Code.SMALL_RESIDUALS
+    return Finding(code, text, sensor=label, severity=severity)
 
 
 def _by_chance(r: Residuals, noise: Noise) -> BoolArray:

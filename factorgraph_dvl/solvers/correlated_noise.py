@@ -415,6 +415,6 @@ def _by_speed(problem: Problem, o: Observation) -> NoiseBySpeed | None:
     growth = problem.noise_growth.get(o.label)
     if growth is None or o.noise_by_speed is None:
         return None
-    factor = float(np.sqrt(np.mean(problem.noise_factors[o.label] ** 2)))
-    std, fraction = o.noise_by_speed
-    return NoiseBySpeed(factor * growth[0] * std, factor * growth[1] * fraction, std, fraction)
+    factors = growth * np.sqrt(np.mean(problem.noise_factors[o.label] ** 2))
+    std, fraction = (factors * o.noise_by_speed).tolist()
+    return NoiseBySpeed(std, fraction, *o.noise_by_speed)

@@ -11,6 +11,7 @@ from monte_carlo import RUNS, nees_of
 from scipy.stats import chi2
 from truth import CONFIGS
 
+from factorgraph_dvl.files.calibration_file import encode_calibration, load_calibration
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.sensors.protocol import velocity_sigma
 from factorgraph_dvl.simulation import parse_scenario, simulate
@@ -52,7 +53,7 @@ def test_noise_as_stated_has_its_parts():
     assert list(growths(solved.problem, solved.minimum.evaluation)) == []
 
 
-def test_a_constant_part_that_is_larger_is_found_and_named():
+def test_a_constant_part_that_is_larger_is_found_and_named(tmp_path):
     solution, solved = solve_with_problem(trial_of(0), rate_hz=1.0)
     (noise,) = [n for n in solution.noise if n.name == "dvl_velocity"]
     assert noise.by_speed.std == pytest.approx(np.hypot(NOISE, 0.001), rel=0.05)
@@ -60,6 +61,10 @@ def test_a_constant_part_that_is_larger_is_found_and_named():
     (reason,) = solution.verdict.reasons
     assert (reason.code, reason.sensor) == (Code.LARGE_RESIDUALS, "DVL velocity")
     assert f"enter velocity_std_m_s: {noise.by_speed.std:.2g} and" in reason.text
+
+    path = tmp_path / "calibration.json"
+    path.write_bytes(encode_calibration(solution))
+    assert load_calibration(path).noise[-1].by_speed == noise.by_speed
 
     problem, evaluation = solved.problem, solved.minimum.evaluation
     (i,) = (i for i, o in enumerate(problem.observations) if o.label == "DVL velocity")
