@@ -443,7 +443,7 @@ class Problem:
         evaluation : Evaluation
             Where they are taken.
         factors : mapping of str to ndarray, optional
-            Factors (d,) by label, by default `noise_factors`.
+            Factors (d,) by label, by default `noise_factors`; (2, d) where noise has two parts.
         """
         factors = self.noise_factors if factors is None else factors
         out = []

@@ -39,8 +39,8 @@ def growths(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[str, Arr
         Factors on the standard deviations, one on average over the measurements.
     factor : float
         By which the factor on all of the noise changes with it.
-    gain : float
-        What -2 log of the likelihood falls by, less what the shape costs.
+    price : float
+        What the shape costs, which -2 log of the likelihood must fall by.
     """
     for i, o in enumerate(problem.observations):
         if o.noise_by_speed is None or o.label not in problem.noise_factors:
@@ -56,24 +56,22 @@ def growths(problem: Problem, evaluation: Evaluation) -> Iterator[tuple[str, Arr
         share = np.stack([constant / whole, grown / whole, other / whole])[:, used]
         squares = residual[used] ** 2
         found, gain = _factors(share, squares / squares.mean(), np.log(now**2))
-        gain -= float(np.log(squares.size))
-        if gain <= 0.0:
+        price = float(np.log(squares.size))
+        if gain <= price:
             continue
         mean = _mean_square(found, share) / _mean_square(now**2, share)
-        yield o.label, np.sqrt(found / _mean_square(found, share)), float(np.sqrt(mean)), gain
+        yield o.label, np.sqrt(found / _mean_square(found, share)), float(np.sqrt(mean)), price
 
 
 def _parts(problem: Problem, evaluation: Evaluation, i: int) -> tuple[Array, Array, Array]:
     """Return the variances (M, d) of all but the noise, and of both parts of that as stated."""
     label = problem.observations[i].label
-    applied, kept = problem.noise_factors[label], problem.noise_growth
+    applied = problem.noise_factors[label]
+    now = problem.noise_growth.get(label, np.ones(2))
     out = []
-    try:
-        for growth in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
-            problem.noise_growth = {**kept, label: np.array(growth)}
-            out.append(problem.sigma(evaluation, {label: applied})[i] ** 2)
-    finally:
-        problem.noise_growth = kept
+    for part in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)):
+        factor = (np.array(part) / now)[:, None] * applied
+        out.append(problem.sigma(evaluation, {label: factor})[i] ** 2)
     other, constant, grown = out
     with np.errstate(invalid="ignore"):
         return other, constant - other, grown - other

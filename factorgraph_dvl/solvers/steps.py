@@ -536,16 +536,14 @@ class NoiseGrowth:
         if at.problem.chain.interpolates or not at.minimum.converged:
             return
         model = at.model
-        for label, growth, change, _ in list(growths(at.problem, at.minimum.evaluation)):
+        for label, growth, change, price in list(growths(at.problem, at.minimum.evaluation)):
+            factor = model.noise_factors[label] * change
             proposal = _from(
                 at,
                 noise_growth={**model.noise_growth, label: growth},
-                noise_factors={
-                    **model.noise_factors,
-                    label: model.noise_factors[label] * change,
-                },
+                noise_factors={**model.noise_factors, label: factor},
             )
-            yield replace(proposal, price=float(np.log(at.problem.used_count)))
+            yield replace(proposal, price=price)
 
 
 class ImuNoise:
