@@ -237,8 +237,9 @@ class Dvl:
         """
         s = self.settings
         speed = np.linalg.norm(self.velocity, axis=1, keepdims=True)
-        model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * speed)
-        return np.maximum(np.where(np.isnan(self.std), model, self.std), LEAST_VELOCITY_SIGMA)
+        model = velocity_sigma((s.velocity_std_m_s, s.velocity_std_fraction), speed, 1.0)
+        own = np.maximum(self.std, LEAST_VELOCITY_SIGMA)
+        return np.where(np.isnan(self.std), model, own)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return misalignment, scale error, lever arm, bias, clock, current and distortion.

@@ -33,7 +33,6 @@ from factorgraph_dvl.sensors.dvl import (
 )
 from factorgraph_dvl.sensors.parameters import SCALAR, Parameter, ParameterSpec
 from factorgraph_dvl.sensors.protocol import (
-    LEAST_VELOCITY_SIGMA,
     ExpectedCorrelation,
     Linearization,
     Motion,
@@ -269,8 +268,8 @@ class DvlBeams:
         v is the beam's own velocity; nan where the beam was lost.
         """
         s = self.settings
-        model = np.hypot(s.velocity_std_m_s, s.velocity_std_fraction * self.velocity)
-        return np.maximum(model, LEAST_VELOCITY_SIGMA)
+        noise = s.velocity_std_m_s, s.velocity_std_fraction
+        return velocity_sigma(noise, self.velocity, 1.0)
 
     def parameters(self) -> tuple[Parameter, ...]:
         """Return directions or misalignment, scale errors, lever arm, clock and window."""

@@ -53,6 +53,7 @@ from factorgraph_dvl.solvers.steps import (
     Step,
     Uncorrelated,
     Walks,
+    WalksFirst,
 )
 
 # Fall of the objective and move of a constant, in standard deviations, below which a step leaves
@@ -127,9 +128,9 @@ def settle(
     known = KnownParameters(at)
     walks = Walks(report, known)
     steps: list[Step] = [
-        MotionStrengths(), States(), Averaging(), Gates(), walks, GrossErrors(), Correlation(),
-        ScaleWalks(), known, ChangedScales(), Noise(), NoiseGrowth(), ImuNoise(), Uncorrelated(),
-        KnownParametersAgain(known), walks,
+        MotionStrengths(), States(), Averaging(), Gates(), WalksFirst(walks), GrossErrors(),
+        Correlation(), ScaleWalks(), known, ChangedScales(), Noise(), NoiseGrowth(), ImuNoise(),
+        Uncorrelated(), KnownParametersAgain(known), walks,
     ]  # fmt: skip
     if roughly:
         steps = [

@@ -587,9 +587,6 @@ class Walks:
         prepared = at.model.prepared
         if self._tried or not isinstance(prepared, Preparation) or self.known.left is not None:
             return
-        # Before parameters are tested, only what explains more of a large misfit than others.
-        if not (np.isfinite(self.known.tested_at) or _biases_explain_more(at)):
-            return
         imu = prepared.trial.inertial
         if not prepared.trial.estimates_noise(imu):
             return
@@ -623,6 +620,25 @@ class Walks:
             *reference,
         )
         self.findings = ()
+
+
+@dataclass
+class WalksFirst:
+    """Biases of the IMU that walk, where one of them explains a large misfit.
+
+    Parameters
+    ----------
+    walks : Walks
+        The step that tries them after all others.
+    """
+
+    walks: Walks
+    name = Walks.name
+
+    def proposals(self, at: Estimated) -> Iterator[Proposal]:
+        """Yield walks before noise and gross errors take their place."""
+        if not np.isfinite(self.walks.known.tested_at) and _biases_explain_more(at):
+            yield from self.walks.proposals(at)
 
 
 def _labels(model: Model) -> str:
