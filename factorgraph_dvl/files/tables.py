@@ -370,7 +370,9 @@ def _parquet_header(path: Path, source: str) -> list[str]:
 
 def _read_parquet(path: Path, header: list[str], names: list[str], source: str) -> pa.Table:
     with _arrow_file(path) as file:
-        table = pyarrow.parquet.read_table(file, columns=names, page_checksum_verification=True)
+        # `read_table` would load the parts of Arrow that are for data of many files.
+        opened = pyarrow.parquet.ParquetFile(file, page_checksum_verification=True)
+        table = opened.read(columns=names)
     for field in table.schema:
         if field.name in TEXT:
             continue

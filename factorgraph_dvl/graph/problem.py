@@ -431,6 +431,15 @@ class Problem:
             for label in {*self.noise_factors, *self.long_run}
         }
 
+    @property
+    def factors_by_part(self) -> dict[str, Array]:
+        """The same by label, (2, d) where a constant part and one by speed have their own."""
+        return {label: self._by_part(label, own) for label, own in self.white_factors.items()}
+
+    def _by_part(self, label: str, factor: Array | float) -> Array:
+        growth = self.noise_growth.get(label)
+        return np.asarray(factor if growth is None else growth[:, None] * factor)
+
     def sigma(
         self, evaluation: Evaluation, factors: Mapping[str, Array | float] | None = None
     ) -> list[Array]:
@@ -451,9 +460,7 @@ class Problem:
             self._bound, evaluation.attached, evaluation.motions, strict=True
         ):
             label = bound.observation.label
-            own = factors.get(label, 1.0) * self.long_run.get(label, 1.0)
-            if label in self.noise_growth:
-                own = self.noise_growth[label][:, None] * own
+            own = self._by_part(label, factors.get(label, 1.0) * self.long_run.get(label, 1.0))
             values = bound.values(evaluation.parameters, self.processes_of(bound))
             sigma = bound.observation.sigma(motion, values, own)
             missing = bound.missing(at, motion, evaluation.parameters, self.processes_of(bound))

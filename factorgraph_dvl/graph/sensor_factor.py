@@ -146,8 +146,8 @@ class NodeMeasurements:
     ) -> Array:
         """Return the standard deviations, (R,), at motions of each kind; infinite beyond the IMU.
 
-        `missing` (R,) is added to the variance; `factors` (d,) multiply what sensors state for
-        their own noise, by label.
+        `missing` (R,) is added to the variance; `factors` (d,), or (2, d) by part, multiply what
+        sensors state for their own noise, by label.
         """
         values = {**self.fixed, **values}
         each = (

@@ -177,7 +177,9 @@ def _minima(form: Array) -> Array:
         gradient = weighed @ C.reshape(*C.shape[:-2], _AXES, 1)
         curvature = weighed @ change.swapaxes(-1, -2)
         trace = np.trace(curvature, axis1=-2, axis2=-1)[..., None, None]
-        step = -np.linalg.solve(curvature + 1e-6 * trace * np.eye(3), gradient)[..., 0]
+        # At rest all velocities may be exactly zero, and no rotation is better than another.
+        damping = np.maximum(1e-6 * trace, np.finfo(float).tiny)
+        step = -np.linalg.solve(curvature + damping * np.eye(3), gradient)[..., 0]
         size = np.sqrt(np.sum(step**2, axis=-1, keepdims=True))
         step *= np.minimum(1.0, _LARGEST_STEP / np.maximum(size, 1e-12))
         C = C @ exp_so3(step)

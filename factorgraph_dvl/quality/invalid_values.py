@@ -33,6 +33,10 @@ _LEAST_STEP = {"m_s": 0.02, "deg": 3e-5}
 # Share of values that are written more than once, and how much more often than chance repeats all
 # components, from which on a log is faster than its instrument. Chosen: one is so at any rate.
 _HELD, _BY_CHANCE = 0.1, 0.1
+# Share of the steps of a component that may be smaller than its last digit. Chosen: damaged ones.
+_ROUNDED = 0.01
+# Digits by which rows that were frozen change, at least. Chosen: coarse ones change by one.
+_DIGITS = 2.0
 # Share of the samples of the IMU that may be frozen. Chosen: more are written several times each.
 _MOST_FROZEN = 0.3
 # Latitude, longitude and height on one scale, deg: a metre is 1e-5 deg.
@@ -202,23 +206,27 @@ def _zero_fills(values: Array) -> Array:
 def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
     """Return which rows (M, n) repeat those before until the value jumps, (M,) bool.
 
-    Where `moving` (M,), without a jump too, if nothing repeats by chance.
+    Where `moving` (M,), without a jump too, if nothing repeats by chance or for coarse digits.
     """
     there = np.flatnonzero(~np.isnan(values).any(axis=1))
     out = np.zeros(values.shape[0], dtype=bool)
     if there.size < 2 * _REPEATED:
         return out
-    steps = np.linalg.norm(np.diff(values[there], axis=0), axis=1)
+    components = np.abs(np.diff(values[there], axis=0))
+    steps = np.linalg.norm(components, axis=1)
     usual = float(np.median(steps))
     if usual == 0.0:
         return out
+    digit = _last_digit(components[components > 0.0])
     starts, ends = runs(steps == 0.0)
     long = ends - starts >= _REPEATED - 1
     by_chance = np.count_nonzero(~long) > np.count_nonzero(long)
     for begin, end in zip(starts.tolist(), ends.tolist(), strict=True):
         # Steps begin .. end - 1 are zero: rows begin + 1 .. end repeat row begin.
-        jumps = end < steps.size and steps[end] > max(_STEPS * usual, least)
-        surely = jumps or (moving[there[begin]] and not by_chance)
+        after = steps[end] if end < steps.size else usual
+        jumps = end < steps.size and after > max(_STEPS * usual, least)
+        changes = after > _DIGITS * digit
+        surely = jumps or (moving[there[begin]] and changes and not by_chance)
         if end - begin + 1 >= _REPEATED and surely:
             out[there[begin + 1 : end + 1]] = True
     return out
@@ -227,21 +235,39 @@ def _frozen(values: Array, least: float, moving: np.ndarray) -> Array:
 def _held(values: Array, moving: BoolArray) -> BoolArray:
     """Return which rows (M, n) were written before, by a log that is faster than its instrument.
 
-    Of rows that are `moving` (M,). Those repeat all components more often than their own repeats
-    make it by chance.
+    Of rows that are `moving` (M,). Those repeat all components more often than their digits make
+    it by chance: where a smooth motion repeats coarse digits, they change by one at a time, and
+    after any time.
     """
     there = np.flatnonzero(moving & ~np.isnan(values).any(axis=1))
     out = np.zeros(moving.size, dtype=bool)
-    same = np.diff(values[there], axis=0) == 0.0
-    every = same.all(axis=1) & (np.diff(there) == 1)
-    written_again = runs(every)[0].size
+    steps = np.abs(np.diff(values[there], axis=0))
+    every = (steps == 0.0).all(axis=1) & (np.diff(there) == 1)
+    begin, end = runs(every)
     new = int(np.count_nonzero(~every))
-    if min(written_again, new) < _REPEATED:
+    # Those that chance makes are of any length.
+    usual, long = np.quantile(end - begin, [0.5, 0.9]) if begin.size else (0.0, 0.0)
+    if min(begin.size, new) < _REPEATED or long > 2.0 * usual + 1.0:
         return out
-    share = written_again / (new + 1)
-    if share > _HELD and np.prod(same[~every].mean(axis=0)) < _BY_CHANCE * share:
+    edges = np.unique(np.concatenate([begin[begin > 0] - 1, end[end < every.size]]))
+    chances = (_chance(every_step, every_step[edges]) for every_step in steps.T)
+    share = begin.size / (new + 1)
+    if share > _HELD and np.prod(list(chances)) < _BY_CHANCE * share:
         out[there[1:][every]] = True
     return out
+
+
+def _chance(steps: Array, beside: Array) -> float:
+    """Return how probably a component repeats, if its steps (M,) are as large as some of them."""
+    nonzero, beside = steps[steps > 0.0], beside[beside > 0.0]
+    if not beside.size:
+        return 1.0
+    return min(_last_digit(nonzero) / float(np.median(beside)), 1.0)
+
+
+def _last_digit(steps: Array) -> float:
+    """Return the unit of the last digit of values, from their steps (M,) that are none of zero."""
+    return float(np.quantile(steps, _ROUNDED))
 
 
 def _finding(label: str, source: str, words: Sequence[Message]) -> Finding:

@@ -94,7 +94,9 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
     rms = float(np.sqrt(np.nanmean(square))) if r.time.size else 0.0
     least = 1.0 if factor is None else float(np.nanmin(factor))
     small = least < NOISE_FACTORS[0]
-    if noise is not None and noise.by_speed is not None and rms <= DO_NOT_FIT:
+    # Standard deviations are stated for all components together.
+    apart = factor is not None and bool(np.nanmax(factor) > NOISE_FACTORS[1] * np.nanmin(factor))
+    if noise is not None and noise.by_speed is not None and rms <= DO_NOT_FIT and not apart:
         usual = not small and bool(np.nanmax(noise.factor) <= NOISE_FACTORS[1])
         return [_by_speed(r.label, noise.by_speed, usual=usual)]
     if rms <= TOO_LARGE:
@@ -118,6 +120,13 @@ def _size_of_residuals(r: Residuals, noise: Noise | None) -> list[Finding]:
             small=least,
             values=enter,
             unit=r.unit,
+            components=list(r.components),
+        )
+    elif apart and code == Code.LARGE_RESIDUALS:
+        text = message(
+            "large_residuals.by_component",
+            large=text,
+            factors=factor,
             components=list(r.components),
         )
     return [Finding(code, text, sensor=r.label, severity=severity)]

@@ -78,7 +78,7 @@ class ReplayStart:
         Spurious information on the parameters, in units of the priors' standard deviations.
     noise_factors : mapping of str to ndarray
         Factors (d,) of each label on the standard deviations that sensors state for their own
-        noise.
+        noise; (2, d) where a constant part and one that grows with speed have their own.
     noise : tuple of Noise
         Noise as it is reported.
     errors : CorrelatedErrors
@@ -245,7 +245,7 @@ def _condensed(
             default=0.0,
         ),
         spurious=spurious,
-        noise_factors=problem.white_factors,
+        noise_factors=problem.factors_by_part,
         noise=noise_of(problem),
         errors=errors,
         noise_known=not any(

@@ -37,7 +37,7 @@ NAME = "beacon"
 
 _SCALE = ParameterSpec("sound_speed_error", labels=SCALAR)
 SOUND_SPEED_ERROR = _SCALE.name
-_CLOCK = Clock.of("beacon", prefix="beacon_")
+_CLOCK = Clock.of("beacon", prefix="beacon_", section="beacons")
 
 # Standard deviations from which on a measurement is an echo. Chosen: by chance one in 2000 is.
 GATE = 3.5

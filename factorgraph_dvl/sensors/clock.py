@@ -65,13 +65,27 @@ class Clock:
     period: ParameterSpec
 
     @classmethod
-    def of(cls, sensor: str, *, prefix: str = "") -> Clock:
-        """Return the clock of a sensor; `prefix` is that of the offset's name."""
+    def of(cls, sensor: str, *, prefix: str = "", section: str = "") -> Clock:
+        """Return the clock of a sensor.
+
+        `prefix` is that of the offset's name, and `section` that of trial.yaml if it is not the
+        sensor's name.
+        """
         offset = ParameterSpec(
-            f"{prefix}time_offset", "s", labels=SCALAR, nuisance=True, plausible=_OFFSET_S
+            f"{prefix}time_offset",
+            "s",
+            labels=SCALAR,
+            nuisance=True,
+            plausible=_OFFSET_S,
+            key=f"{section or sensor}: time_offset_std_s",
         )
         rate = ParameterSpec(
-            f"{sensor}_clock_rate", "ppm", labels=SCALAR, nuisance=True, plausible=_RATE_PPM
+            f"{sensor}_clock_rate",
+            "ppm",
+            labels=SCALAR,
+            nuisance=True,
+            plausible=_RATE_PPM,
+            key=f"{section or sensor}: clock_rate_std_ppm",
         )
         sawtooth = ParameterSpec(
             f"{sensor}_sawtooth_delay",

@@ -30,7 +30,14 @@ from factorgraph_dvl.settings.sections import NonNegative, Positive, Vector3
 
 _SEA_SURFACE = ParameterSpec("sea_surface_height", "m", labels=SCALAR)
 SEA_SURFACE_HEIGHT = _SEA_SURFACE.name
-_SCALE = ParameterSpec("depth_scale_error", labels=SCALAR)
+# Plausible. Chosen: fresh water for sea water.
+_SCALE = ParameterSpec(
+    "depth_scale_error",
+    labels=SCALAR,
+    plausible=0.03,
+    of_record=True,
+    key="depth: scale_error_std",
+)
 SCALE_ERROR = _SCALE.name
 _CLOCK = Clock.of("depth", prefix="depth_")
 

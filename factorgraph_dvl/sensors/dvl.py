@@ -74,7 +74,9 @@ SCALE_SPEC = ParameterSpec("scale_error", labels=SCALAR, place=3, limit=1e-3, ab
 SCALES_SPEC = replace(SCALE_SPEC, labels=XYZ, frame="d")
 LEVER_ARM_SPEC = ParameterSpec("lever_arm", "m", frame="b", place=4, limit=0.1)
 # Plausible size, m/s. Chosen: ten times the bias of a DVL that is in order.
-BIAS_SPEC = ParameterSpec("dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1)
+BIAS_SPEC = ParameterSpec(
+    "dvl_bias", "m_s", frame="d", nuisance=True, plausible=0.1, key="dvl: bias_std_m_s"
+)
 CLOCK = Clock.of("dvl")
 AVERAGING_SPEC = averaging_spec()
 

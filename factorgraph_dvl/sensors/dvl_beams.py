@@ -77,7 +77,7 @@ DIRECTION = direction_spec(1).name
 SCALE_ERROR = scale_spec(1).name
 # Of the parameters that a DVL beside the beams has under the same names.
 BEAM_PREFIX = "beam_"
-_OWN_CLOCK = Clock.of("beam", prefix=BEAM_PREFIX)
+_OWN_CLOCK = Clock.of("beam", prefix=BEAM_PREFIX, section="dvl_beams")
 _OWN_AVERAGING = averaging_spec(BEAM_PREFIX)
 
 Angle = Annotated[float, msgspec.Meta(ge=-360, le=360)]

@@ -28,7 +28,12 @@ _BY_XY = tuple(f"{turned}{by}" for turned in "xyz" for by in "xy")
 
 
 def _spec(
-    stem: str, unit: str, labels: tuple[str, ...], plausible: float, frame: Frame = "d"
+    stem: str,
+    unit: str,
+    labels: tuple[str, ...],
+    plausible: float,
+    frame: Frame = "d",
+    key: str = "",
 ) -> ParameterSpec:
     return ParameterSpec(
         f"dvl_{stem}",
@@ -38,12 +43,13 @@ def _spec(
         nuisance=True,
         plausible=plausible,
         of_record=True,
+        key=key,
     )
 
 
 # Plausible sizes. Chosen: of a mount that one would send back, of water from the tropics to ice.
-AXES_SPEC = _spec("axes", "deg", ("xy", "xz", "yz"), 1.0)
-SCALE_DIFFERENCE_SPEC = _spec("scale_difference", "", ("y", "z"), 0.01)
+AXES_SPEC = _spec("axes", "deg", ("xy", "xz", "yz"), 1.0, key="dvl: axes_std_deg")
+SCALE_DIFFERENCE_SPEC = _spec("scale_difference", "", ("y", "z"), 0.01, key="dvl: scale_error_std")
 FLEX_BY_TILT_SPEC = _spec("flex_by_tilt", "", _BY_XY, 0.1, "b")
 FLEX_BY_RATE_SPEC = _spec("flex_by_rate", "s", _BY_XY, 0.1, "b")
 FLEX_BY_SPEED_SPEC = _spec("flex_by_speed", "deg_s_m", XYZ, 0.5, "b")

@@ -50,7 +50,14 @@ LEVER_ARM = "gnss_lever_arm_m"
 HORIZONTAL_AND_UP = ((0, 1), (2,))
 
 # Plausible size, m. Chosen: a vessel's length, for an antenna that was not measured.
-_LEVER_ARM = ParameterSpec("gnss_lever_arm", "m", frame="b", nuisance=True, plausible=5.0)
+_LEVER_ARM = ParameterSpec(
+    "gnss_lever_arm",
+    "m",
+    frame="b",
+    nuisance=True,
+    plausible=5.0,
+    key="gnss: lever_arm_std_m",
+)
 # Correlation time of velocities where none is stated, s. Chosen: that of filters in receivers.
 _VELOCITY_TIME = 2.0
 # Rate of the body relative to itself.

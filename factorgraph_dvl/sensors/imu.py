@@ -167,7 +167,15 @@ def _error_spec(
 ) -> tuple[ParameterSpec, tuple[ImuError, ...]]:
     """Return what errors of one kind are, and the elements that they stand for."""
     labels = tuple("xyz"[i] if elements is _DIAGONAL else "xyz"[i] + "xyz"[j] for i, j in elements)
-    spec = ParameterSpec(stem, unit, labels=labels, frame="b", nuisance=True, plausible=plausible)
+    spec = ParameterSpec(
+        stem,
+        unit,
+        labels=labels,
+        frame="b",
+        nuisance=True,
+        plausible=plausible,
+        key=f"imu: {stem}_std_{unit}",
+    )
     return spec, tuple(ImuError(of, by, i, j) for i, j in elements)
 
 

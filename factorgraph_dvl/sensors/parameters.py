@@ -87,6 +87,8 @@ class ParameterSpec:
         Whether it changes one record only, and no motion: the rows of that record test it.
     searched : bool, default False
         Whether a search finds when it counts, as where it is zero for most of a trial.
+    key : str, optional
+        Section and key of trial.yaml with its standard deviation, such as `dvl: bias_std_m_s`.
     """
 
     stem: str
@@ -102,6 +104,7 @@ class ParameterSpec:
     usual: bool = False
     of_record: bool = False
     searched: bool = False
+    key: str = ""
 
     @cached_property
     def name(self) -> str:

@@ -69,7 +69,12 @@ _TRANSCEIVER = ParameterSpec(
     "usbl_transceiver_lever_arm", "m", frame="b", nuisance=True, plausible=5.0
 )
 _TRANSPONDER = ParameterSpec(
-    "usbl_transponder_lever_arm", "m", frame="b", nuisance=True, plausible=2.0
+    "usbl_transponder_lever_arm",
+    "m",
+    frame="b",
+    nuisance=True,
+    plausible=2.0,
+    key="usbl: transponder_lever_arm_std_m",
 )
 MISALIGNMENT, SOUND_SPEED_ERROR = _MISALIGNMENT.name, _SCALE.name
 TRANSCEIVER_LEVER_ARM, TRANSPONDER_LEVER_ARM = _TRANSCEIVER.name, _TRANSPONDER.name

@@ -152,7 +152,6 @@ def _walked(
     )
     test.reject(problem.rejected)
     test.noise_factors = noise
-    test.noise_growth = problem.noise_growth
     test.robust_weights = problem.robust_weights
     at = test.values(start.states, test.prior_values() | start.parameters)
     minimum = minimise(test, at, stage="walking biases", progress=report)

@@ -180,7 +180,8 @@ def change_findings(
             said,
             name=best.name,
             size=change.size,
-            std=change.std,
+            # With the scatter of the scores, as the significance has it.
+            std=abs(change.size) / change.significance,
             unit=f" {unit}" if unit else "",
             time=change.time,
             others=others,

@@ -20,7 +20,7 @@ from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
 from factorgraph_dvl.plausibility.earlier_calibration import prior_against_data
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
-from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.sensors.parameters import UNITS, XYZ, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
@@ -345,7 +345,9 @@ def explanation_findings(
                 std=_uncertainty(e.parameter),
                 chi2=_chi_square(e),
                 value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
+                axes=_axes(e),
                 others=_leap_seconds(e.parameter, evaluation) or _shape(e) or _or(e),
+                stated_by=_key(e.parameter),
             ),
             parameter=e.parameter.name,
         )
@@ -368,6 +370,21 @@ def explanation_findings(
             )
         )
     return tuple(out)
+
+
+def _axes(found: Explanation) -> Message | str:
+    """Return which components the values of a parameter are, in brackets."""
+    spec = found.parameter.spec
+    # The words of a shape say so.
+    if spec.size == 1 or spec.labels == XYZ or found.shape is not None:
+        return ""
+    return message("words.in_brackets", words=list(spec.labels))
+
+
+def _key(p: Parameter) -> Message | str:
+    """Return which key of trial.yaml has the standard deviation of a parameter."""
+    section, _, key = p.spec.key.partition(": ")
+    return message("estimated_instead.key", section=section, std=key) if key else ""
 
 
 def _leap_seconds(p: Parameter, evaluation: Evaluation) -> Message | None:

@@ -35,7 +35,7 @@ from factorgraph_dvl.solvers.known_parameters import Explanation, explanation, i
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated, Model, linear_objective
 from factorgraph_dvl.solvers.motion_strengths import LEAST_GAIN, Strengths
-from factorgraph_dvl.solvers.noise_growth import growths
+from factorgraph_dvl.solvers.noise_growth import growths, normalised
 from factorgraph_dvl.solvers.outliers import noise_of_the_rest, robust_weights
 from factorgraph_dvl.solvers.preparation import Preparation
 from factorgraph_dvl.solvers.process_fit import refitted
@@ -531,19 +531,31 @@ class NoiseGrowth:
 
     name = "noise by speed"
 
+    def __init__(self) -> None:
+        self._asked = _Asked()
+
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
-        """Yield the parts that residuals ask for, of each log."""
-        if at.problem.chain.interpolates or not at.minimum.converged:
+        """Yield the parts that residuals ask for, of each log, then some of the way to them."""
+        model, problem, minimum = at.model, at.problem, at.minimum
+        own = model.noise_factors, model.noise_growth, model.processes, model.robust_weights
+        if problem.chain.interpolates or not minimum.converged or self._asked.before(*own):
             return
-        model = at.model
-        for label, growth, change, price in list(growths(at.problem, at.minimum.evaluation)):
-            factor = model.noise_factors[label] * change
-            proposal = _from(
-                at,
-                noise_growth={**model.noise_growth, label: growth},
-                noise_factors={**model.noise_factors, label: factor},
-            )
-            yield replace(proposal, price=price)
+        self._asked.note(*own)
+        for label, found, parts, price in list(
+            growths(problem, minimum.evaluation, minimum.information)
+        ):
+            now = model.noise_growth.get(label, np.ones(2))
+            for share in _SHARES:
+                growth, factor = normalised(now ** (1.0 - share) * found**share, parts)
+                proposal = _from(
+                    at,
+                    noise_growth={**model.noise_growth, label: growth},
+                    noise_factors={
+                        **model.noise_factors,
+                        label: model.noise_factors[label] * factor,
+                    },
+                )
+                yield replace(proposal, price=price, nearer=share < 1.0)
 
 
 class ImuNoise:

@@ -36,6 +36,13 @@ def test_mirrored_axes_are_told_by_the_determinant(exact):
     assert np.sum(right.residual**2) > 5.0 * np.sum(free.residual**2)
 
 
+def test_a_log_that_measures_exactly_nothing_has_no_mounting_and_no_error(exact):
+    trial, windows = exact
+    still = replace(trial.dvl, velocity=np.zeros_like(trial.dvl.velocity))
+    fit = dvl_windows(windows, still).fit(0.0)
+    assert np.isfinite(fit.residual).all()
+
+
 def test_a_late_clock_leaves_residuals_until_it_is_set_right(exact):
     trial, windows = exact
     late = replace(trial.dvl, time=trial.dvl.time + 0.3)

@@ -109,6 +109,21 @@ def test_a_log_at_5_hz_of_an_instrument_at_4_is_faster_too():
     assert missing(out) == np.flatnonzero(np.diff(rows, prepend=-1) == 0).tolist()
 
 
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0])
+@pytest.mark.parametrize("noise", [0.001, 0.002, 0.003])
+def test_coarse_digits_of_a_smooth_motion_are_measured(rate_hz, noise):
+    time = np.arange(900 * rate_hz) / rate_hz
+    straight = 0.3 * np.sin(2.0 * np.pi * time / 300.0), 0.0 * time
+    turns = ((time // 60.0) % 2.0) * np.sin(2.0 * np.pi * time / 60.0)
+    for ahead, aside in (straight, (0.2 * turns, 0.1 * turns)):
+        motion = np.stack([1.0 + ahead, aside, 0.0 * time], axis=1)
+        motion += noise * np.random.default_rng(0).standard_normal(motion.shape)
+        table = {"time_s": time}
+        table |= dict(zip(VELOCITY_COLUMNS, np.round(motion, 2).T, strict=True))
+        out, found = without_invalid_values("dvl", table, "dvl.csv")
+        assert (missing(out), found) == ([], [])
+
+
 def test_fixes_that_a_faster_log_writes_again_are_missing_and_one_held_at_rest_is_not():
     time = np.arange(300) * 0.2
     since = np.floor(time)

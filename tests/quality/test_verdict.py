@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from builders import build_solution
 
-from factorgraph_dvl.estimates import Noise, Residuals
+from factorgraph_dvl.estimates import Noise, NoiseBySpeed, Residuals
 from factorgraph_dvl.files.trial_yaml import LimitSettings
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import consistency_findings
@@ -91,6 +91,20 @@ def test_one_message_says_which_noise_to_enter_where_it_is_larger_and_smaller_th
     assert "3.2 times" in found.text
     assert "0.2 times as large" in found.text
     assert "enter 0.4, 0.2 m/s (east, north)" in found.text
+
+
+def test_noise_of_one_axis_alone_is_told_by_axis():
+    factor = np.array([1.0, 6.8])
+    residuals = Residuals(
+        *("DVL velocity", "m/s", ("x", "y"), np.arange(50.0)),
+        residual=np.tile([0.1, -0.68], (50, 1)),
+        sigma=np.full((50, 2), 0.1) * factor,
+    )
+    noise = Noise("dvl_velocity", factor, by_speed=NoiseBySpeed(0.3, 0.006, 0.1, 0.002))
+    (found,) = consistency_findings([], [residuals], [noise])
+    assert found.code == Code.LARGE_RESIDUALS
+    assert "1, 6.8 times as large as stated (x, y)" in found.text
+    assert "enter" not in found.text
 
 
 @pytest.mark.parametrize(

@@ -113,3 +113,29 @@ def test_a_prior_that_the_data_put_far_outside_is_widened(trial):
     assert abs(bias.value[1] - 0.03) < 4.0 * bias.std[1]
     scale = solution.estimate("scale_error")
     assert abs(scale.value[0] - 0.005) < 4.0 * scale.std[0]
+
+
+@pytest.mark.slow
+def test_a_depth_that_is_too_large_is_named_and_no_scale_of_the_dvl():
+    """By 1 %, in a dive to 40 m with fixes at the surface; and a sensor that is right."""
+    down = [{"climb_m_s": -0.5, "to_height_m": -30}, {"straight_s": 60}]
+    up = [{"climb_m_s": 0.5, "to_height_m": 10}, {"straight_s": 60}]
+    dive = scenario(
+        noise=True,
+        manoeuvres=[{"straight_s": 60}, *down, *up],
+        start={"lat_deg": 36, "lon_deg": 121, "height_m": 10, "speed_m_s": 1.5},
+        gnss={"outages_s": [[60, 300]], "position_std_m": [0.1, 0.1, 0.1]},
+        dvl={"rate_hz": 2},
+        depth={"rate_hz": 1, "std_m": 0.02, "sea_surface_height_m": 11.0},
+    )
+    trial = simulate(dive, 0)
+    (depth,) = trial.others
+    for factor in (1.0, 1.01):
+        wrong = replace(trial, others=(replace(depth, depth=factor * depth.depth),))
+        solution = solve(wrong, rate_hz=1.0)
+        named = [r for r in solution.verdict.reasons if r.code == Code.ESTIMATED_INSTEAD]
+        assert [r.parameter for r in named] == ["depth_scale_error"][: int(factor > 1.0)]
+        for reason in named:
+            assert "depth: {scale_error_std: …}" in reason.text
+            e = solution.estimate("depth_scale_error")
+            assert e.value[0] == pytest.approx(0.01, abs=4.0 * e.std[0])
