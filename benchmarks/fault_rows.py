@@ -429,6 +429,13 @@ ROWS = (
         (r"dvl_flex",),
     ),
     Row(
+        "DVL: takes roll and pitch out",
+        "share",
+        (1.0,),
+        lambda x: [g.dvl_levelled(x)],
+        (r"dvl_flex_by_tilt",),
+    ),
+    Row(
         "DVL: sound speed varies with place",
         "share",
         (0.0005, 0.002),

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from factorgraph_dvl.geometry.earth import LocalFrame
+from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
 from factorgraph_dvl.simulation.faults import Fault, record_of, with_arrays
@@ -32,6 +33,21 @@ def dvl_flexes(turn_deg_per_deg: Sequence[float], by: str = "roll") -> Fault:
         angle = _along(trial, dvl.time, _reference(trial).rph[:, ("roll", "pitch").index(by)])
         turn = Rotation.from_rotvec(angle[:, None] * np.asarray(turn_deg_per_deg, float))
         return with_arrays(trial, "dvl", velocity=turn.apply(dvl.velocity))
+
+    return fault
+
+
+def dvl_levelled(share: float = 1.0) -> Fault:
+    """Let the DVL take a share of roll and pitch out of its velocities."""
+
+    def fault(trial: Trial, rng: np.random.Generator) -> Trial:
+        dvl, rph = record_of(trial, "dvl"), _reference(trial).rph
+        tilt = np.stack([_along(trial, dvl.time, rph[:, i]) for i in range(2)], axis=1)
+        mounted = Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
+        in_frd = mounted.inv().apply(dvl.velocity) @ frd_from_body(trial.body_axes).T
+        level = Rotation.from_euler("xy", share * tilt).apply(in_frd)
+        velocity = mounted.apply(level @ frd_from_body(trial.body_axes))
+        return with_arrays(trial, "dvl", velocity=velocity)
 
     return fault
 

@@ -19,6 +19,7 @@ from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS
 from factorgraph_dvl.plausibility.earlier_calibration import prior_against_data
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.sensors.dvl_distortion import FLEX_BY_TILT
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.parameters import UNITS, XYZ, Parameter
 from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
@@ -41,6 +42,8 @@ _LOG10_P_OF_RECORD = -4.0
 # Standard deviations of what is plausible that a parameter may be off. Chosen: beyond, it is not
 # the cause.
 _FAR = 4.0
+# Share of a vehicle's tilt that may be missing of a turn by all of it. Chosen: tilt sensors lag.
+_WHOLE = 0.2
 # Standard deviations of its prior that a parameter must be off to be estimated without. Chosen: by
 # chance it is seldom beyond three.
 _OUTSIDE = 5.0
@@ -346,7 +349,10 @@ def explanation_findings(
                 chi2=_chi_square(e),
                 value=_numbers(e.parameter, evaluation.parameters[e.parameter.name]),
                 axes=_axes(e),
-                others=_leap_seconds(e.parameter, evaluation) or _shape(e) or _or(e),
+                others=_leap_seconds(e.parameter, evaluation)
+                or _levelled(e.parameter, evaluation)
+                or _shape(e)
+                or _or(e),
                 stated_by=_key(e.parameter),
             ),
             parameter=e.parameter.name,
@@ -393,6 +399,17 @@ def _leap_seconds(p: Parameter, evaluation: Evaluation) -> Message | None:
         return None
     off = abs(float(evaluation.parameters[p.name][0]))
     return message("leap_seconds.estimated") if abs(off - LEAP_SECONDS) < 1.0 else None
+
+
+def _levelled(p: Parameter, evaluation: Evaluation) -> Message | None:
+    """Return that a DVL takes its tilt out of its velocities, None if it does not."""
+    if p.name != FLEX_BY_TILT:
+        return None
+    turns = evaluation.parameters[p.name].reshape(3, 2)
+    # All of it, about x by the tilt along y, and about y by that along x.
+    across = turns[0, 1], turns[1, 0]
+    whole = all(abs(abs(turn) - 1.0) < _WHOLE for turn in across) and across[0] * across[1] < 0.0
+    return message("estimated_instead.levelled") if whole else None
 
 
 def _shape(found: Explanation) -> Message | None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders import build_trial
 
+from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.simulation import instrument_faults as g
 from factorgraph_dvl.simulation.faults import dvl_water_track, with_faults
 from factorgraph_dvl.trial import Reference
@@ -39,6 +40,21 @@ def test_a_mount_turns_with_roll(trial):
     roll = np.interp(made.dvl.time, trial.reference.time, trial.reference.rph[:, 0])
     angle = np.arctan2(made.dvl.velocity[:, 1], made.dvl.velocity[:, 0])
     np.testing.assert_allclose(angle, roll / 30.0, atol=1e-12)
+
+
+def test_a_dvl_takes_roll_and_pitch_out(trial):
+    """What is level stays so: of a record in body axes, the direction of down is (0, 0, 1)."""
+    roll, pitch = (
+        np.interp(trial.dvl.time, trial.reference.time, trial.reference.rph[:, i])
+        for i in range(2)
+    )
+    down = np.stack([-np.sin(pitch), np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll)])
+    in_body = down.T @ frd_from_body(trial.body_axes)
+    tilted = replace(trial, dvl=replace(trial.dvl, velocity=in_body))
+    made = with_faults(tilted, [g.dvl_levelled()]).dvl.velocity
+    expected = np.array([0.0, 0.0, 1.0]) @ frd_from_body(trial.body_axes)
+    np.testing.assert_allclose(made, np.tile(expected, (len(made), 1)), atol=1e-12)
+    assert np.abs(in_body - made).max() > 0.01
 
 
 def test_gyros_are_late_or_lag(trial):

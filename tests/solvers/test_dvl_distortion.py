@@ -71,6 +71,21 @@ def test_the_cause_is_named_and_estimated(name, seed):
         assert np.all(np.abs(e.value - EXPECTED[name]) < np.maximum(4.0 * e.std, 1e-4))
 
 
+@pytest.mark.slow
+def test_velocities_that_are_levelled_are_named():
+    """Of a DVL that takes roll and pitch out of them, whole turns of the mount by its tilt."""
+    plan = yaml.safe_load((CONFIGS / "cruise.yaml").read_text(encoding="utf-8"))
+    plan["manoeuvres"][2]["repeat"] = 1
+    honest = simulate(parse_scenario(plan), 0)
+    trial = faults.with_faults(honest, [instrument_faults.dvl_levelled()])
+    found = solve(trial, rate_hz=1.0)
+    first = found.verdict.reasons[0]
+    assert first.parameter == "dvl_flex_by_tilt"
+    assert "corrected by roll and pitch" in first.text
+    e = found.estimate("dvl_flex_by_tilt")
+    assert np.abs(e.value[[1, 2]]) == pytest.approx([1.0, 1.0], abs=0.01)
+
+
 def test_an_honest_trial_is_told_of_none_of_these():
     found = solve(trial_in(2), rate_hz=1.0)
     assert found.verdict.grade == "good"
