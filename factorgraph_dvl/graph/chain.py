@@ -206,6 +206,18 @@ class Chain(Protocol):
         Where the motion between nodes is not recorded, or recorded with noise.
         """
 
+    def averaged(self, at: Any, lin: Linearization, length: float) -> Array | None:
+        """Return what means over windows of a length, s, take from that, (M, d).
+
+        None of a chain without samples, which leaves windows out.
+        """
+
+    def curved(self, at: Any, lin: Linearization, step: float) -> Array | None:
+        """Return how far it bends what is predicted within a step, s, (M, d); likewise.
+
+        That is the covariance with twice itself less what it is a step before and after.
+        """
+
     def motion(self, at: Any, states: Any) -> Motion:
         """Return the motion at M attached times."""
 

@@ -45,7 +45,9 @@ from factorgraph_dvl.imu.two_way import (
     TwoWayTransition,
     attach_two_way,
     motion_two_way,
+    noise_averaged,
     noise_between,
+    noise_curved,
     transition_two_way,
 )
 from factorgraph_dvl.sensors.imu import ERRORS, ImuSettings
@@ -239,12 +241,27 @@ class InertialChain(AtTrueTimes):
         None for positions and attitudes: it is below a millimetre there, and below the noise of
         the gyro over a second.
         """
+        density = self._noise_density(lin)
+        return None if density is None else noise_between(at)[:, None] * density
+
+    def averaged(self, at: TwoWay, lin: Linearization, length: float) -> Array | None:
+        """Return what windows of a length take from `missing`, (M, d); None where that is none."""
+        density = self._noise_density(lin)
+        return None if density is None else noise_averaged(at, length)[:, None] * density
+
+    def curved(self, at: TwoWay, lin: Linearization, step: float) -> Array | None:
+        """Return how far noise bends what is predicted towards the nodes, (M, d), in a step, s."""
+        density = self._noise_density(lin)
+        return None if density is None else noise_curved(at, step)[:, None] * density
+
+    def _noise_density(self, lin: Linearization) -> Array | None:
+        """Return the density (M, d) of the noise of what is predicted, per second."""
         if lin.d_v is None:
             return None
         out = self.imu.accel_noise_root_psd**2 * np.sum(lin.d_v**2, axis=2)
         if lin.d_theta is not None:
             out = out + self.imu.gyro_noise_root_psd**2 * np.sum(lin.d_theta**2, axis=2)
-        return noise_between(at)[:, None] * out
+        return np.asarray(out)
 
     def motion(self, at: TwoWay, states: States) -> Motion:
         """Return the motion at M attached times, carried from the nodes on both sides."""

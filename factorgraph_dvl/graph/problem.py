@@ -44,6 +44,7 @@ from factorgraph_dvl.graph.priors import (
 )
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.template import jacobian_template
+from factorgraph_dvl.imu.window_means import SHORTEST
 from factorgraph_dvl.sensors.gross_errors import gross_errors
 from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.sensors.protocol import (
@@ -408,6 +409,31 @@ class Problem:
         self._weighed_at = evaluation.values
         for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
             bound.weight = weight
+        if not self.chain.interpolates:
+            self.tilt = self._tilt_of_windows(evaluation)
+
+    def _tilt_of_windows(self, evaluation: Evaluation) -> Tilt | None:
+        """Return what lengths of windows take of the cost by averaging noise of the IMU.
+
+        Residuals have this noise. A longer window has less of it, whatever the sensor does, and
+        would be the better model for that alone.
+        """
+        gradient = np.zeros(len(self.prior_root))
+        for bound, at, motion in zip(
+            self._bound, evaluation.attached, evaluation.motions, strict=True
+        ):
+            name = bound.observation.averaging
+            if name not in self.columns:
+                continue
+            length = max(abs(float(evaluation.parameters[name][0])), SHORTEST)
+            saved = bound.averaged(at, motion, evaluation.parameters, length)
+            if saved is not None:
+                used = np.where(bound.weight > 0.0, bound.weight**2 * saved, 0.0)
+                gradient[self.columns[name]] += 0.5 * float(np.sum(used)) / length
+        if not gradient.any():
+            return None
+        sigma = np.concatenate([p.sigma for p in self.parameters])
+        return Tilt(gradient, sigma, self.prior_values())
 
     def weighed(self, evaluation: Evaluation) -> Evaluation:
         """Weigh the measurements as `weigh` does; return what the evaluation then is."""

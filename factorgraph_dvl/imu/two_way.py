@@ -234,3 +234,40 @@ def noise_between(at: TwoWay) -> Array:
     """
     tau, span = at.forward.tau, at.forward.tau - at.backward.tau
     return np.asarray(tau * (1.0 - 2.0 * at.share) + at.share**2 * span)
+
+
+def noise_averaged(at: TwoWay, length: float) -> Array:
+    """Return what a window takes from `noise_between`, (M,), s: at most a sixth of its length.
+
+    The mean of W over a window around tau takes the place of W(tau). W continues beyond the nodes.
+    Next to one of them a window would have more noise, but the node follows it: that is none.
+
+    Parameters
+    ----------
+    at : TwoWay
+        Attachment of M times.
+    length : float, s
+        Length of the windows, above 0.
+    """
+    tau, span = at.forward.tau, at.forward.tau - at.backward.tau
+    first, last = tau - 0.5 * length, tau + 0.5 * length
+    before, inside = np.maximum(-first, 0.0), np.maximum(first, 0.0)
+    square = np.where(
+        before > 0.0,
+        (before**3 + np.maximum(last, 0.0) ** 3) / (3.0 * length**2),
+        inside + length / 3.0,
+    )
+    # Of the mean and W(T).
+    within = np.clip(last, 0.0, span)
+    both = (0.5 * (within**2 - inside**2) + span * np.maximum(last - span, 0.0)) / length
+    averaged = square - 2.0 * at.share * both + at.share**2 * span
+    return np.maximum(noise_between(at) - averaged, 0.0)
+
+
+def noise_curved(at: TwoWay, step: float) -> Array:
+    """Return how far noise bends what is between the nodes towards zero, (M,), s.
+
+    That is its covariance with twice itself less what it is a step before and after: its integral
+    has a kink there, and is known at the nodes.
+    """
+    return np.asarray(np.clip(np.minimum(at.forward.tau, -at.backward.tau), 0.0, step))

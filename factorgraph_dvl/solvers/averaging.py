@@ -22,6 +22,7 @@ from factorgraph_dvl.solvers.known_parameters import evidence
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import (
+    by_noise,
     of_whole,
     part_of,
     record_scores,
@@ -97,6 +98,9 @@ def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: s
     if name == _length(bound):
         squares = of_whole(name, squares_at(problem, bound, minimum))
     sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
+    if squares is not None:
+        whole, motion = part_of(problem, bound, np.arange(bound.observation.time.size), evaluation)
+        sums.score[:] -= by_noise(whole, motion, evaluation)
     known = sums.square - information.covariance_of([sums.by_key])
     return Scores(places_of(unknown), sums.score, known, unknown[name]).test([name])
 
@@ -176,6 +180,9 @@ def _scores(
     length = _length(bound)
     squares = {length: squares_at(problem, bound, minimum)[some]} if length in known else {}
     scores = record_scores(problem, part, evaluation, information, known, motion, squares)
+    if length in known:
+        own = scores.places[length]
+        scores.score[own] -= by_noise(part, motion, evaluation)
     return scores, count / some.size
 
 

@@ -249,3 +249,15 @@ def by_square(
     out /= 24.0 * _BETWEEN**2
     out[~covered] = 0.0
     return out[:, :, None]
+
+
+def by_noise(bound: BoundObservation, motion: Motion, evaluation: Evaluation) -> float:
+    """Return the score that noise of the IMU has by the square of the length, 1/s², on average.
+
+    Residuals have the noise that bends what is predicted, whatever the sensor does.
+    """
+    bend = bound.curved(bound.attachment, motion, evaluation.parameters, _BETWEEN)
+    if bend is None:
+        return 0.0
+    used = bound.weight > 0.0
+    return float(np.sum((bound.weight**2 * bend)[used])) / (24.0 * _BETWEEN**2)

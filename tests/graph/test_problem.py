@@ -102,6 +102,31 @@ def test_nothing_holds_factors_that_are_eliminated():
     assert after.equals(before, 0.0)
 
 
+def test_noise_that_a_window_averages_has_a_gradient():
+    """Half of Σ density (L / 6) / σ², for pings far from nodes: and the same in the graph."""
+    means = {"dvl": ALL_FREE["dvl"] | {"averaging_s": 0.2, "averaging_std_s": 0.1}}
+    problem, values = problem_of(scenario(manoeuvres=SHORT, trial=ALL_FREE | means))
+    problem.weigh(problem.evaluate(values))
+    at = problem.evaluate(values)
+    own = problem.columns["averaging_s"]
+    gradient = problem.tilt.gradient[own]
+    (i,) = (i for i, o in enumerate(problem.observations) if o.averaging == "averaging_s")
+    density = problem.chain.imu.accel_noise_root_psd**2
+    most = 0.5 * np.sum(problem.weights[i] ** 2) * density / 6.0
+    assert 0.3 * most < gradient < 1.1 * most
+    assert not np.delete(problem.tilt.gradient, np.arange(own.start, own.stop)).any()
+
+    def there():
+        moved = problem.values(at.states, at.parameters | {"averaging_s": np.array([0.3])})
+        slope = problem.linearize(at).gradientAtZero().at(problem.key("averaging_s"))[0]
+        return np.array([problem.evaluate(moved).cost, slope])
+
+    tilted, problem.tilt = there(), None
+    # The cost counts from what is stated.
+    expected = gradient[0] * np.array([0.3 - 0.2, 1.0])
+    np.testing.assert_allclose(tilted - there(), expected, rtol=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["constant", "walking", "IMU errors", "means"])
 def test_blocks_equal_custom_factors_with_numerical_jacobians(kind):
     more = {"imu": IMU_ERRORS} if kind == "IMU errors" else {}
@@ -111,6 +136,8 @@ def test_blocks_equal_custom_factors_with_numerical_jacobians(kind):
     problem, values = problem_of(scene)
     assert problem.chain.walking == (kind == "walking")
     problem.weigh(problem.evaluate(values))
+    # That of a window is a factor of its own.
+    problem.tilt = None
     evaluation = problem.evaluate(values)
     factors = measurement_factors(problem, problem.linearize(evaluation))
     layout = rows_by_factor(problem, evaluation)

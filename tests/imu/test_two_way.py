@@ -8,7 +8,7 @@ from jacobians import differentiate
 from problems import SHORT, problem_of
 from truth import scenario
 
-from factorgraph_dvl.imu.two_way import attach_two_way, noise_between
+from factorgraph_dvl.imu.two_way import attach_two_way, noise_averaged, noise_between, noise_curved
 
 CLOCKS = {
     "imu": {"accel_noise_ug_sqrt_hz": 500.0},
@@ -95,6 +95,32 @@ def test_at_nodes_the_motion_is_theirs(noisy):
     np.testing.assert_allclose(motion.nRb, states.nRb, atol=1e-10)
     # Transposed, attitudes of 30 deg are not theirs.
     assert np.abs(motion.nRb.transpose(0, 2, 1) - states.nRb).max() > 0.1
+
+
+def test_windows_average_noise_by_hand_and_by_chance(noisy):
+    """In a second: a sixth of 0.3 s half way, and none at a node; and of walks drawn."""
+    problem, _ = noisy
+    seg, rate = problem.chain.segments, problem.chain.frame.earth_rate
+    begin, span = seg.node_time[1], seg.duration[1]
+    tau = np.array([0.0, 0.1, 0.25, 0.5, 0.8]) * span
+    at = attach_two_way(seg, begin + tau, rate)
+    np.testing.assert_allclose(noise_averaged(at, 0.3)[3], 0.3 / 6.0, rtol=1e-6)
+    assert noise_averaged(at, 0.3)[0] == 0.0
+    np.testing.assert_allclose(
+        noise_curved(at, 0.1), np.minimum(np.minimum(tau, span - tau), 0.1), atol=1e-6
+    )
+    # From two seconds before the node to two after the next.
+    steps, dt = np.arange(-2.0, 3.0 * span, 0.01), 0.01
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(np.sqrt(dt) * rng.standard_normal((20_000, steps.size)), axis=1)
+    walk -= walk[:, [int(np.argmin(np.abs(steps)))]]
+    there = walk[:, int(np.argmin(np.abs(steps - span)))]
+    for length in (0.3, 1.6):
+        for i, t in enumerate(tau):
+            inside = np.abs(steps - t) <= 0.5 * length + 1e-9
+            left = walk[:, inside].mean(axis=1) - at.share[i] * there
+            taken = noise_between(at)[i] - np.mean(left**2)
+            assert noise_averaged(at, length)[i] == pytest.approx(max(taken, 0.0), abs=0.01)
 
 
 def test_half_way_it_is_the_mean_of_both_and_a_quarter_of_the_noise_by_hand(noisy):

@@ -85,6 +85,27 @@ def test_noise_of_gyros_hides_no_window(grade):
 
 
 @pytest.mark.slow
+def test_noise_of_an_imu_is_no_window_and_moves_none():
+    """Of a consumer IMU, whose noise a longer window averages: a DVL without and with one."""
+    off = []
+    for length, noise in ((0.0, 300.0), *[(0.5, 150.0)] * max(RUNS // 4, 3)):
+        plan = yaml.safe_load((CONFIGS / "cruise.yaml").read_text(encoding="utf-8"))
+        plan["manoeuvres"][2]["repeat"] = 1
+        plan["imu"] |= {"gyro_noise_deg_sqrt_h": 0.1, "accel_noise_ug_sqrt_hz": noise}
+        plan["dvl"]["averaging_s"] = length
+        plan["trial"]["dvl"]["averaging_s"] = 0
+        trial = simulate(parse_scenario(plan), len(off))
+        found = solve(trial, rate_hz=1.0)
+        assert found.verdict.grade == "good"
+        assert nees_of(found, trial) < chi2.ppf(0.999, 7)
+        if length > 0.0:
+            (e,) = (e for e in found.estimates if e.name == "averaging_s")
+            off.append((e.value[0] - length) / e.std[0])
+    # It was 4 standard deviations.
+    assert np.abs(np.mean(off)) < 1.0 + 3.0 / np.sqrt(len(off)), off
+
+
+@pytest.mark.slow
 def test_a_long_window_is_no_contradiction():
     found = solve(trial_of(2.0, 1))
     assert found.estimate("averaging_s").value[0] == pytest.approx(2.0, abs=0.02)
