@@ -186,6 +186,7 @@ def objective_again(problem: Problem, evaluation: Evaluation) -> float:
         start=problem.bound_at,
         clock_zero=problem.clock_zero,
         processes=problem.processes,
+        tilt=problem.tilt,
     )
     again.reject(problem.rejected)
     again.noise_factors, again.noise_growth = problem.noise_factors, problem.noise_growth

@@ -407,29 +407,35 @@ class Problem:
     def weigh(self, evaluation: Evaluation) -> None:
         """Set the weights of all measurements from their standard deviations there."""
         self._weighed_at = evaluation.values
-        for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
+        weights = self._weights(evaluation)
+        for bound, weight in zip(self._bound, weights, strict=True):
             bound.weight = weight
         if not self.chain.interpolates:
-            self.tilt = self._tilt_of_windows(evaluation)
+            self.tilt = self._tilt_of_windows(evaluation, weights)
 
-    def _tilt_of_windows(self, evaluation: Evaluation) -> Tilt | None:
+    def _tilt_of_windows(self, evaluation: Evaluation, weights: Sequence[Array]) -> Tilt | None:
         """Return what lengths of windows take of the cost by averaging noise of the IMU.
 
         Residuals have this noise. A longer window has less of it, whatever the sensor does, and
         would be the better model for that alone.
         """
         gradient = np.zeros(len(self.prior_root))
-        for bound, at, motion in zip(
-            self._bound, evaluation.attached, evaluation.motions, strict=True
+        for bound, weight, at, motion in zip(
+            self._bound, weights, evaluation.attached, evaluation.motions, strict=True
         ):
             name = bound.observation.averaging
             if name not in self.columns:
                 continue
-            length = max(abs(float(evaluation.parameters[name][0])), SHORTEST)
+            size = abs(float(evaluation.parameters[name][0]))
+            length = max(size, SHORTEST)
             saved = bound.averaged(at, motion, evaluation.parameters, length)
             if saved is not None:
-                used = np.where(bound.weight > 0.0, bound.weight**2 * saved, 0.0)
-                gradient[self.columns[name]] += 0.5 * float(np.sum(used)) / length
+                used = np.where(weight > 0.0, weight**2 * saved, 0.0)
+                # Below that, what a window does goes by the square x² of its length: it takes
+                # (6 x² - 2 x⁴) / 24 of it, as its covariance with what it averages is 1/8 of it.
+                short = size / length
+                share = 1.5 * short - 0.5 * short**3
+                gradient[self.columns[name]] += 0.5 * share * float(np.sum(used)) / length
         if not gradient.any():
             return None
         sigma = np.concatenate([p.sigma for p in self.parameters])
@@ -437,17 +443,29 @@ class Problem:
 
     def weighed(self, evaluation: Evaluation) -> Evaluation:
         """Weigh the measurements as `weigh` does; return what the evaluation then is."""
+        at = self.without_tilt(evaluation)
         self.weigh(evaluation)
+        own_cost = at.own_cost
+        if self.tilt is not None:
+            own_cost += self.tilt.cost(self.parameters, evaluation.parameters)
         residuals, cost = self._whitened(evaluation.motions, evaluation.parameters)
-        return replace(evaluation, residuals=residuals, cost=evaluation.own_cost + cost)
+        return replace(evaluation, residuals=residuals, cost=own_cost + cost, own_cost=own_cost)
 
     def needs_reweighting(self, evaluation: Evaluation) -> bool:
         """Whether standard deviations there are other than those that measurements count by."""
-        for bound, weight in zip(self._bound, self._weights(evaluation), strict=True):
+        weights = self._weights(evaluation)
+        for bound, weight in zip(self._bound, weights, strict=True):
             used = weight > 0.0
             if np.any(np.abs(bound.weight[used] / weight[used] - 1.0) > SAME_WEIGHT):
                 return True
-        return False
+        if self.chain.interpolates:
+            return False
+        zero = np.zeros(len(self.prior_root))
+        now, then = (
+            zero if tilt is None else tilt.gradient
+            for tilt in (self.tilt, self._tilt_of_windows(evaluation, weights))
+        )
+        return bool(np.any(np.abs(now - then) > SAME_WEIGHT * np.abs(then)))
 
     @property
     def white_factors(self) -> dict[str, Array]:

@@ -182,9 +182,10 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     The difference x - x0 of posterior and prior has the variance σ0² - σ²; without the prior
     x would be (x - x0) σ² / (σ0² - σ²) further deviation. The standard deviations by which other
     parameters would move are fewer. What is usual of a sensor that nothing is stated of, as the
-    window over which it averages, is no prior that data contradict.
+    window over which it averages, is no prior that data contradict, nor is what is plausible.
     """
-    if e.spec.usual:
+    plausible = e.spec.plausible is not None and np.allclose(e.prior_std, e.spec.plausible)
+    if e.spec.usual or plausible:
         return []
     informed = e.std < _INFORMED * e.prior_std
     if not informed.any():

@@ -50,7 +50,7 @@ def _spec(
 # Plausible sizes. Chosen: of a mount that one would send back, of water from the tropics to ice.
 AXES_SPEC = _spec("axes", "deg", ("xy", "xz", "yz"), 1.0, key="dvl: axes_std_deg")
 SCALE_DIFFERENCE_SPEC = _spec("scale_difference", "", ("y", "z"), 0.01, key="dvl: scale_error_std")
-FLEX_BY_TILT_SPEC = _spec("flex_by_tilt", "", _BY_XY, 0.3, "b")
+FLEX_BY_TILT_SPEC = _spec("flex_by_tilt", "", _BY_XY, 0.1, "b")
 FLEX_BY_RATE_SPEC = _spec("flex_by_rate", "s", _BY_XY, 0.1, "b")
 FLEX_BY_SPEED_SPEC = _spec("flex_by_speed", "deg_s_m", XYZ, 0.5, "b")
 SCALE_BY_SPEED_SPEC = _spec("scale_by_speed", "s_m", SCALAR, 0.01)

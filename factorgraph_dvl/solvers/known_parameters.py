@@ -325,7 +325,11 @@ def _shown_by_records(
 
 def _is_plausible(p: Parameter, test: Score) -> bool:
     """Whether a parameter can be as far from what it was taken to be."""
-    return bool(np.all(np.abs(test.step) < _FAR * wide(p, p.mean).sigma))
+    most = _FAR * wide(p, p.mean).sigma
+    if p.name == FLEX_BY_TILT:
+        # Of a DVL that takes its tilt out of its velocities.
+        most = np.maximum(most, 1.0 + _WHOLE)
+    return bool(np.all(np.abs(test.step) < most))
 
 
 def _chi_square(explanation: Explanation) -> Message:

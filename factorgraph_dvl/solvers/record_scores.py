@@ -254,8 +254,12 @@ def by_square(
 def by_noise(bound: BoundObservation, motion: Motion, evaluation: Evaluation) -> float:
     """Return the score that noise of the IMU has by the square of the length, 1/s², on average.
 
-    Residuals have the noise that bends what is predicted, whatever the sensor does.
+    Residuals have the noise that bends what is predicted, whatever the sensor does; those of
+    means have hardly any of it.
     """
+    window = bound.window(evaluation.parameters)
+    if window is not None and abs(window.length) > _BETWEEN:
+        return 0.0
     bend = bound.curved(bound.attachment, motion, evaluation.parameters, _BETWEEN)
     if bend is None:
         return 0.0

@@ -210,7 +210,9 @@ class Averaging:
         if not found:
             return
         freed = (wide(p, p.mean) for p in model.parameters if p.name in found)
-        yield Proposal(_with_others(at, *freed), at.states, {**at.values, **found})
+        there = {**at.values, **found}
+        changed = replace(_with_others(at, *freed), reference=(at.states, there))
+        yield Proposal(changed, at.states, there)
 
 
 class GrossErrors:
