@@ -198,25 +198,11 @@ class BoundObservation:
         """
         if not self._sees_motion:
             return None
-        missing = self.chain.missing(at, self._of_motion(motion, parameters, processes))
+        missing = self.chain.missing(at, self.by_motion(motion, parameters, processes))
         self._sees_motion = missing is not None
         return missing
 
-    def averaged(
-        self, at: Any, motion: Motion, parameters: Mapping[str, Array], length: float
-    ) -> Array | None:
-        """Return what a window of a length, s, takes of that, (M, d); None if nothing."""
-        lin = self._of_motion(motion, parameters, Processes(None, ()))
-        return self.chain.averaged(at, lin, length)
-
-    def curved(
-        self, at: Any, motion: Motion, parameters: Mapping[str, Array], step: float
-    ) -> Array | None:
-        """Return how far it bends what is predicted in a step, s, (M, d); None if it does not."""
-        lin = self._of_motion(motion, parameters, Processes(None, ()))
-        return self.chain.curved(at, lin, step)
-
-    def _of_motion(
+    def by_motion(
         self, motion: Motion, parameters: Mapping[str, Array], processes: Processes
     ) -> Linearization:
         """Return the derivatives by the motion; those by one that is recorded do not change."""

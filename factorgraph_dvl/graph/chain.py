@@ -322,6 +322,12 @@ class WithoutImu:
         """Return the nodes from the first of some steps to that of the steps after them."""
         return range(block.start, block.stop + (block.stop == self.count))
 
+    def averaged(self, at: Any, lin: Linearization, length: float) -> None:
+        """Return nothing: without samples there is nothing to average."""
+
+    def curved(self, at: Any, lin: Linearization, step: float) -> None:
+        """Return nothing, likewise."""
+
     def add_prior(
         self,
         graph: gtsam.NonlinearFactorGraph,

@@ -255,12 +255,6 @@ class PlanarChain(WithoutImu, AtTrueTimes):
         """Angle by which meridians converge per metre to the east, rad/m."""
         return float(np.tan(self.frame.lat)) / EARTH_RADIUS
 
-    def averaged(self, at: Attached, lin: Linearization, length: float) -> None:
-        """Return nothing: without samples there is nothing to average."""
-
-    def curved(self, at: Attached, lin: Linearization, step: float) -> None:
-        """Return nothing, likewise."""
-
     def missing(self, at: Attached, lin: Linearization) -> Array:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 

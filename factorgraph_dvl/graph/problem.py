@@ -411,10 +411,14 @@ class Problem:
         for bound, weight in zip(self._bound, weights, strict=True):
             bound.weight = weight
         if not self.chain.interpolates:
-            self.tilt = self._tilt_of_windows(evaluation, weights)
+            gradient = self._gradient_of_windows(evaluation, weights)
+            sigma = [p.sigma for p in self.parameters]
+            self.tilt = None
+            if gradient.any():
+                self.tilt = Tilt(gradient, np.concatenate(sigma), self.prior_values())
 
-    def _tilt_of_windows(self, evaluation: Evaluation, weights: Sequence[Array]) -> Tilt | None:
-        """Return what lengths of windows take of the cost by averaging noise of the IMU.
+    def _gradient_of_windows(self, evaluation: Evaluation, weights: Sequence[Array]) -> Array:
+        """Return what lengths of windows take of the cost by averaging noise of the IMU, (P,).
 
         Residuals have this noise. A longer window has less of it, whatever the sensor does, and
         would be the better model for that alone.
@@ -428,7 +432,8 @@ class Problem:
                 continue
             size = abs(float(evaluation.parameters[name][0]))
             length = max(size, SHORTEST)
-            saved = bound.averaged(at, motion, evaluation.parameters, length)
+            lin = bound.by_motion(motion, evaluation.parameters, self.processes_of(bound))
+            saved = self.chain.averaged(at, lin, length)
             if saved is not None:
                 used = np.where(weight > 0.0, weight**2 * saved, 0.0)
                 # Below that, what a window does goes by the square x² of its length: it takes
@@ -436,10 +441,7 @@ class Problem:
                 short = size / length
                 share = 1.5 * short - 0.5 * short**3
                 gradient[self.columns[name]] += 0.5 * share * float(np.sum(used)) / length
-        if not gradient.any():
-            return None
-        sigma = np.concatenate([p.sigma for p in self.parameters])
-        return Tilt(gradient, sigma, self.prior_values())
+        return gradient
 
     def weighed(self, evaluation: Evaluation) -> Evaluation:
         """Weigh the measurements as `weigh` does; return what the evaluation then is."""
@@ -460,11 +462,8 @@ class Problem:
                 return True
         if self.chain.interpolates:
             return False
-        zero = np.zeros(len(self.prior_root))
-        now, then = (
-            zero if tilt is None else tilt.gradient
-            for tilt in (self.tilt, self._tilt_of_windows(evaluation, weights))
-        )
+        then = self._gradient_of_windows(evaluation, weights)
+        now = 0.0 if self.tilt is None else self.tilt.gradient
         return bool(np.any(np.abs(now - then) > SAME_WEIGHT * np.abs(then)))
 
     @property

@@ -282,12 +282,6 @@ class SmoothChain(WithoutImu):
         # By the same nodes of the track: others would only fill the information matrix.
         return Attached(replace(turned, tau=time - self.node_time[turned.node]), turned)
 
-    def averaged(self, at: Attached, lin: Linearization, length: float) -> None:
-        """Return nothing: without samples there is nothing to average."""
-
-    def curved(self, at: Attached, lin: Linearization, step: float) -> None:
-        """Return nothing, likewise."""
-
     def missing(self, at: Attached, lin: Linearization) -> Array | None:
         """Return the variance (M, d) of what is predicted at attached times given the nodes.
 

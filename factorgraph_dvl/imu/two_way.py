@@ -260,8 +260,7 @@ def noise_averaged(at: TwoWay, length: float) -> Array:
     # Of the mean and W(T).
     within = np.clip(last, 0.0, span)
     both = (0.5 * (within**2 - inside**2) + span * np.maximum(last - span, 0.0)) / length
-    averaged = square - 2.0 * at.share * both + at.share**2 * span
-    return np.maximum(noise_between(at) - averaged, 0.0)
+    return np.maximum(tau - square - 2.0 * at.share * (tau - both), 0.0)
 
 
 def noise_curved(at: TwoWay, step: float) -> Array:

@@ -306,8 +306,7 @@ def dvl_water_track(
         east, north, up = current_m_s
         in_frd = level.inv().apply([north, east, -up])
         in_body = in_frd @ frd_from_body(trial.body_axes)
-        mounted = Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
-        moved = dvl.velocity - mounted.apply(in_body) * inside[:, None]
+        moved = dvl.velocity - mounting_of(trial).apply(in_body) * inside[:, None]
         return with_arrays(trial, "dvl", velocity=moved)
 
     return fault
@@ -533,6 +532,11 @@ def with_truth(trial: Trial, name: str, change: Array) -> Trial:
     truth = dict(trial.calibration_truth)
     truth[name] = truth.get(name, 0.0) + change
     return replace(trial, calibration_truth=truth)
+
+
+def mounting_of(trial: Trial) -> Rotation:
+    """Return the true rotation from body axes to those of the DVL."""
+    return Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
 
 
 def record_of(trial: Trial, section: str) -> Any:

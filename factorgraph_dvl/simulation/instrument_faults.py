@@ -13,7 +13,7 @@ from factorgraph_dvl.geometry.earth import LocalFrame
 from factorgraph_dvl.geometry.rotations import frd_from_body
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.sensors.attitude import Attitude, AttitudeSettings
-from factorgraph_dvl.simulation.faults import Fault, record_of, with_arrays
+from factorgraph_dvl.simulation.faults import Fault, mounting_of, record_of, with_arrays
 from factorgraph_dvl.trial import Reference, Trial
 
 
@@ -43,11 +43,10 @@ def dvl_levelled(share: float = 1.0) -> Fault:
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl, rph = record_of(trial, "dvl"), _reference(trial).rph
         tilt = np.stack([_along(trial, dvl.time, rph[:, i]) for i in range(2)], axis=1)
-        mounted = Rotation.from_rotvec(trial.calibration_truth["misalignment_deg"], degrees=True)
-        in_frd = mounted.inv().apply(dvl.velocity) @ frd_from_body(trial.body_axes).T
+        mounted, to_frd = mounting_of(trial), frd_from_body(trial.body_axes)
+        in_frd = mounted.inv().apply(dvl.velocity) @ to_frd.T
         level = Rotation.from_euler("xy", share * tilt).apply(in_frd)
-        velocity = mounted.apply(level @ frd_from_body(trial.body_axes))
-        return with_arrays(trial, "dvl", velocity=velocity)
+        return with_arrays(trial, "dvl", velocity=mounted.apply(level @ to_frd))
 
     return fault
 

@@ -99,8 +99,7 @@ def _by_all(problem: Problem, bound: BoundObservation, minimum: Minimum, name: s
         squares = of_whole(name, squares_at(problem, bound, minimum))
     sums = record_sums_in_turn(problem, bound, evaluation, unknown, squares)
     if squares is not None:
-        whole, motion = part_of(problem, bound, np.arange(bound.observation.time.size), evaluation)
-        sums.score[:] -= by_noise(whole, motion, evaluation)
+        sums.score[:] -= by_noise(problem, bound, evaluation).sum()
     known = sums.square - information.covariance_of([sums.by_key])
     return Scores(places_of(unknown), sums.score, known, unknown[name]).test([name])
 
@@ -181,8 +180,8 @@ def _scores(
     squares = {length: squares_at(problem, bound, minimum)[some]} if length in known else {}
     scores = record_scores(problem, part, evaluation, information, known, motion, squares)
     if length in known:
-        own = scores.places[length]
-        scores.score[own] -= by_noise(part, motion, evaluation)
+        noise = by_noise(problem, bound, evaluation)[some]
+        scores.score[scores.places[length]] -= noise.sum()
     return scores, count / some.size
 
 

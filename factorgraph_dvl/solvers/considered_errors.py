@@ -24,7 +24,6 @@ from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.record_scores import (
     by_noise,
     of_whole,
-    part_of,
     record_sums_in_turn,
     squares_at,
 )
@@ -92,15 +91,14 @@ def _by_windows(problem: Problem, minimum: Minimum) -> Iterator[ConsideredError]
         unknown = {p.name: np.full(1, np.inf)}
         squares = of_whole(p.name, squares_at(problem, bound, minimum))
         sums = record_sums_in_turn(problem, bound, minimum.evaluation, unknown, squares)
-        every = np.arange(bound.observation.time.size)
-        noise = by_noise(*part_of(problem, bound, every, minimum.evaluation), minimum.evaluation)
         moved = minimum.information.covariance_with([sums.by_key])
         taken_up = moved.after(sums.by_key)
         known = max(float((sums.square - taken_up)[0, 0]), 0.0)
         # Means over windows that share pings are rare.
         between = np.diff(np.unique(bound.observation.time))
         longest = min(p.spec.plausible, float(np.median(between)) if between.size else np.inf)
-        size = likely_square(float(sums.score[0]) - noise, known, longest)
+        noise = by_noise(problem, bound, minimum.evaluation).sum()
+        size = likely_square(float(sums.score[0] - noise), known, longest)
         label = bound.observation.label
         upto = f"up to {np.sqrt(2.0 * size):.2g} s"
         yield ConsideredError(f"averaging of {label}", upto, moved.times(-size))

@@ -20,12 +20,12 @@ from scipy.optimize import minimize
 
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.graph.problem import Evaluation, Problem
-from factorgraph_dvl.statistics.leverage import leverage
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 from factorgraph_dvl.statistics.variance_components import (
     LEAST_FACTOR,
     LEAST_REDUNDANCY,
     PRIOR_LOG_STD,
+    residuals_with_leverages,
 )
 
 # Groups of measurements by speed whose squares are summed. Chosen: variances in one differ little.
@@ -65,14 +65,15 @@ def growths(
         whole = now[0] ** 2 * constant + now[1] ** 2 * grown + other
         share = np.stack([constant / whole, grown / whole, other / whole])[:, used]
         long_run = problem.long_run.get(o.label, np.ones(used.shape[1]))
-        squares = ((evaluation.residuals[i] * long_run) ** 2)[used]
-        freedom = 1.0 - _leverages(problem, evaluation, information, o.label)[used]
+        found = residuals_with_leverages(problem, evaluation, information, {o.label})
+        residual, h = found[o.label]
+        squares, freedom = ((residual * long_run) ** 2)[used], 1.0 - h[used]
         # No part is smaller than what a record shows that was smoothed, or rounded.
         least = LEAST_FACTOR / float(np.max(problem.noise_factors[o.label]))
-        found, gain = _factors(share, squares, freedom, np.log(now**2), 2.0 * np.log(least))
+        parts, gain = _factors(share, squares, freedom, np.log(now**2), 2.0 * np.log(least))
         price = float(np.log(squares.size))
         if gain > price:
-            yield o.label, np.sqrt(found), share[:2], price
+            yield o.label, np.sqrt(parts), share[:2], price
 
 
 def normalised(parts: Array, share: Array) -> tuple[Array, float]:
@@ -87,15 +88,6 @@ def normalised(parts: Array, share: Array) -> tuple[Array, float]:
     """
     mean = np.sqrt(np.mean(parts**2 @ share / share.sum(axis=0)))
     return parts / mean, float(mean)
-
-
-def _leverages(
-    problem: Problem, evaluation: Evaluation, information: SquareRootInformation, label: str
-) -> Array:
-    """Return the leverages (M, d) of the measurements of a label."""
-    own = [each for each in problem.observation_rows(evaluation) if each.source == label]
-    count = sum(each.vector.size for each in own)
-    return np.concatenate([h for _, h in leverage(lambda: own, count, information)])
 
 
 def _parts(problem: Problem, evaluation: Evaluation, i: int) -> tuple[Array, Array, Array]:

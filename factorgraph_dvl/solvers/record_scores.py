@@ -251,17 +251,17 @@ def by_square(
     return out[:, :, None]
 
 
-def by_noise(bound: BoundObservation, motion: Motion, evaluation: Evaluation) -> float:
+def by_noise(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:
     """Return the score that noise of the IMU has by the square of the length, 1/s², on average.
 
-    Residuals have the noise that bends what is predicted, whatever the sensor does; those of
-    means have hardly any of it.
+    Of each measurement of a record, (M,). Residuals have the noise that bends what is predicted,
+    whatever the sensor does; those of means have hardly any of it.
     """
-    window = bound.window(evaluation.parameters)
-    if window is not None and abs(window.length) > _BETWEEN:
-        return 0.0
-    bend = bound.curved(bound.attachment, motion, evaluation.parameters, _BETWEEN)
-    if bend is None:
-        return 0.0
-    used = bound.weight > 0.0
-    return float(np.sum((bound.weight**2 * bend)[used])) / (24.0 * _BETWEEN**2)
+    values, i = evaluation.parameters, problem.bound.index(bound)
+    window = bound.window(values)
+    lin = bound.by_motion(evaluation.motions[i], values, problem.processes_of(bound))
+    bend = bound.chain.curved(evaluation.attached[i], lin, _BETWEEN)
+    if bend is None or (window is not None and abs(window.length) > _BETWEEN):
+        return np.zeros(bound.observation.time.size)
+    score = np.where(bound.weight > 0.0, bound.weight**2 * bend, 0.0)
+    return np.asarray(np.sum(score, axis=1)) / (24.0 * _BETWEEN**2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,18 +101,32 @@ def variance_components(
     information : SquareRootInformation
         Information there.
     """
-    estimated = problem.noise_factors.keys()
-    count = sum(
-        residual.size
-        for o, residual in zip(problem.observations, evaluation.residuals, strict=True)
-        if o.label in estimated
-    )
+    found = residuals_with_leverages(problem, evaluation, information, problem.noise_factors)
+    return {label: _white(problem, evaluation, label, *own) for label, own in found.items()}
+
+
+def residuals_with_leverages(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    labels: Container[str],
+) -> dict[str, tuple[Array, Array]]:
+    """Return whitened residuals (M, d) and their leverages (M, d), by label.
+
+    Parameters
+    ----------
+    problem, evaluation, information : Problem, Evaluation or SquareRootInformation
+        Problem with its weights, the minimum, and the information there.
+    labels : container of str
+        Measurements that are asked for, by label.
+    """
+    own = [each for each in problem.observation_rows(evaluation) if each.source in labels]
+    count = sum(each.vector.size for each in own)
     found: dict[str, list[tuple[Array, Array]]] = {}
-    own = [each for each in problem.observation_rows(evaluation) if each.source in estimated]
     for rows, h in leverage(lambda: own, count, information):
         found.setdefault(rows.source, []).append((rows.vector, h))
     return {
-        label: _white(problem, evaluation, label, *map(np.concatenate, zip(*parts, strict=True)))
+        label: (np.concatenate([v for v, _ in parts]), np.concatenate([h for _, h in parts]))
         for label, parts in found.items()
     }
 
