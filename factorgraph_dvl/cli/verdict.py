@@ -55,6 +55,7 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         transceiver_of,
     )
     from factorgraph_dvl.analysis.mount import mount_in_words
+    from factorgraph_dvl.quality.notation import sentence
     from factorgraph_dvl.quality.texts import text_of
     from factorgraph_dvl.report.entries import (
         MOUNT,
@@ -67,8 +68,12 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
     is_usable = solution.verdict.grade != "do not use" and has_instrument_terms(solution)
     both = sum_with_compass(solution.findings) if is_usable else None
     if not events.active():
+        said = {reason.code for reason in solution.verdict.reasons[:1]}
         for reason in solution.verdict.reasons[1:_REASONS]:
-            stdout().print(f"{reason.severity}: {reason}", markup=False, soft_wrap=True)
+            action = "" if reason.code in said else f" {reason.code.action}"
+            said.add(reason.code)
+            line = f"{reason.severity}: {sentence(str(reason))}{action}"
+            stdout().print(line, markup=False, soft_wrap=True)
         if both is not None:
             stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)
     if is_usable:

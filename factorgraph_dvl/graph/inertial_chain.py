@@ -325,8 +325,8 @@ class InertialChain(AtTrueTimes):
         gyro, accel = self.biases
         for parameter, bias, first in ((gyro, states.gyro_bias, 3), (accel, states.accel_bias, 0)):
             select = np.eye(BIAS_SIZE)[first : first + 3] / parameter.si
-            by_node = {keys.bias(k): w * select for k, w in enumerate(weight)}
-            functional = by_node if self.walking else {keys.bias(0): select}
+            share = weight if self.walking else [1.0]
+            functional = {keys.bias(k): w * select for k, w in enumerate(share)}
             yield parameter, weight @ bias / parameter.si, functional
 
     def trajectory(

@@ -32,6 +32,9 @@ _FEW = 10
 _ALLOWED, _FASTEST_CURRENT = 0.25, 3.0
 # How far sway may take that ratio from the one of averages where a beam angle explains both.
 _SWAY = 0.1
+# Misalignment, rad, up to whose σ a mounting is known well enough to show where the vehicle moves.
+# Beyond that from the bow, it is likely another mounting. Chosen: drift in a current is less.
+_KNOWN = 30.0 * DEG
 
 
 def dvl_findings(
@@ -135,9 +138,9 @@ def _steady_ratio(time: Array, dvl: Array, gnss: Array) -> float:
 def _sign_findings(
     dvl: Dvl, body_axes: BodyAxes, velocity_d: Array, positive: Message
 ) -> Iterator[Finding]:
-    """Check that the vehicle moves ahead, where the mounting is known well enough."""
+    """Check where the vehicle moves to, where the mounting is known well enough."""
     misalignment = next(p for p in dvl.parameters() if p.name == MISALIGNMENT)
-    if misalignment.sigma.max() > 30.0 * DEG:
+    if misalignment.sigma.max() > _KNOWN:
         return
     dRb = exp_so3(misalignment.mean)
     frd = velocity_d @ dRb @ frd_from_body(body_axes).T
@@ -145,7 +148,7 @@ def _sign_findings(
     moving = horizontal > MOVING_M_S
     if moving.sum() < 3:
         return
-    ahead = float(np.median(frd[moving, 0] / horizontal[moving]))
+    ahead, starboard = np.median(frd[moving, :2] / horizontal[moving, None], axis=0)
     if ahead < -0.5:
         yield Finding(
             Code.DVL_SIGN,
@@ -153,11 +156,13 @@ def _sign_findings(
             dvl.label,
         )
     elif ahead > 0.5:
+        angle = float(np.arctan2(starboard, ahead))
+        side = "course.starboard" if angle > 0.0 else "course.port"
         yield Finding(
             Code.DVL_SIGN,
-            message("dvl_sign.ahead"),
+            message("dvl_sign.ahead", where=message(side, angle=abs(angle) / DEG)),
             dvl.label,
-            severity="ok",
+            severity="ok" if abs(angle) < _KNOWN else "note",
         )
 
 

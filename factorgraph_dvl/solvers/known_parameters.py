@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -29,6 +29,12 @@ from factorgraph_dvl.solvers.record_scores import record_scores
 from factorgraph_dvl.solvers.sawtooth import sawtooths
 from factorgraph_dvl.solvers.shape import Shape, Shapes, searched
 from factorgraph_dvl.solvers.water_span import water_spans
+from factorgraph_dvl.statistics.marginal_likelihood import (
+    by_place,
+    constants_of,
+    covariance_with_states,
+    gradient_by_name,
+)
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_by_source
 from factorgraph_dvl.statistics.scores import Score
@@ -502,7 +508,36 @@ def freed(
                 ),
             )
 
-    return parameter_scores(parts, columns, information, step)
+    out = parameter_scores(parts, columns, information, step)
+    if not problem.chain.interpolates:
+        return out
+    test, at = with_parameters(problem, evaluation, every)
+    slopes = _slopes(test, at, information.given(constants_of(problem)), columns)
+    return replace(out, scores=out.scores.with_slopes(slopes))
+
+
+def _slopes(
+    problem: Problem,
+    evaluation: Evaluation,
+    given: SquareRootInformation,
+    columns: Mapping[str, tuple[int, Array]],
+) -> dict[str, Array]:
+    """Return half the gradient of log det of the states' information by parameters, by name.
+
+    Parameters
+    ----------
+    problem, evaluation : Problem or Evaluation
+        Problem in which they are free, and where it is.
+    given : SquareRootInformation
+        Information on the states given the constants.
+    columns : mapping of str to tuple of (int, ndarray)
+        The parameters: that of `ParameterScores`.
+    """
+    every, constants = list(problem.observation_rows(evaluation)), constants_of(problem)
+    with_states = by_place(every, covariance_with_states(every, given, constants))
+    wide = {name: sigma for name, (_, sigma) in columns.items()}
+    found = gradient_by_name(problem, evaluation, with_states, wide)
+    return {name: 0.5 * slope for name, slope in found.items()}
 
 
 def _with_shapes(evaluation: Evaluation, shapes: Sequence[Parameter]) -> Evaluation:

@@ -6,7 +6,7 @@ after the first are nearer to the present one.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -130,7 +130,7 @@ class MotionStrengths:
         """Yield strengths that the residuals ask for, and others on the way there."""
         model = at.model
         # What other assumptions made of the noise is to be found anew.
-        own = model.parameters, model.robust_weights, _labels(model)
+        own = model.parameters, model.robust_weights, _labels(model.processes)
         if self._settled.before(*own):
             return
         found = model.prepared.strengths(at.problem, at.minimum)
@@ -227,7 +227,7 @@ class GrossErrors:
         """Yield the gross errors that are found where all measurements count."""
         model, problem = at.model, at.problem
         # Once some are left out, others show, and what was taken for some fits.
-        own = model.parameters, model.prepared, model.robust_weights, _labels(model)
+        own = model.parameters, model.prepared, model.robust_weights, _labels(model.processes)
         if self._asked.before(*own):
             return
         self._asked.note(*own)
@@ -294,7 +294,7 @@ class ScaleWalks:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield the walks with the lowest objective by the linear model, where that is lower."""
         model = at.model
-        own = model.prepared, model.parameters, _labels(model)
+        own = model.prepared, model.parameters, _labels(model.processes)
         if not at.minimum.converged or model.chain.interpolates or self._asked.before(*own):
             return
         self._asked.note(*own)
@@ -340,7 +340,7 @@ class Uncorrelated:
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield models without one of the processes that were found."""
         model = at.model
-        own = model.prepared, _labels(model)
+        own = model.prepared, _labels(model.processes)
         if self._asked.before(*own) or not at.minimum.converged:
             return
         self._asked.note(*own)
@@ -408,7 +408,11 @@ class KnownParameters:
     def _at_first(self, at: Estimated) -> Explanation | None:
         """Return what explains the first minimum, None where that has other parameters."""
         first, model = self.first, at.model
-        found = model.robust_weights or model.processes != model.stated_processes
+        # Without an IMU, what is the same kind of noise has other strengths than assumed at first.
+        other = model.processes != model.stated_processes
+        if model.chain.interpolates:
+            other = _labels(model.processes) != _labels(model.stated_processes)
+        found = model.robust_weights or other
         if first is None or first.model.parameters is not model.parameters or not found:
             return None
         return _explained(_applied(first))
@@ -479,8 +483,9 @@ def _different(now: Explanation | None, at_first: Explanation | None) -> list[Ex
 def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     """Yield what estimates a parameter instead, with noise as stated and as found."""
     freed = _with_others(at, *cause.freed)
-    # What the misfit made of noise and gross errors is to be found anew.
-    for model in (freed.as_stated(), freed):
+    # What the misfit made of noise and gross errors is to be found anew. Without an IMU, strengths
+    # follow any change of the parameters.
+    for model in (freed,) if freed.chain.interpolates else (freed.as_stated(), freed):
         yield Proposal(model, at.states, at.values, price=cause.price)
 
 
@@ -609,7 +614,9 @@ class Walks:
             return
         self._tried = True
         first = self.known.first
-        if first is not None and (self.known.freed or _labels(at.model) != _labels(first.model)):
+        if first is not None and (
+            self.known.freed or _labels(at.model.processes) != _labels(first.model.processes)
+        ):
             # Lasting noise or a freed parameter may have taken the place of a walk.
             at = _applied(first)
         # A walk explains what is beyond the noise that is stated.
@@ -655,9 +662,9 @@ class WalksFirst:
             yield from self.walks.proposals(at)
 
 
-def _labels(model: Model) -> str:
+def _labels(processes: Iterable[Process]) -> str:
     """Return which noise persists."""
-    return ", ".join(p.label for p in model.processes)
+    return ", ".join(p.label for p in processes)
 
 
 def _are_those(some: tuple[Any, ...], others: tuple[Any, ...] | None) -> bool:

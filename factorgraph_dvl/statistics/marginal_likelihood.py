@@ -188,11 +188,34 @@ def log_determinant_gradient(
     if not constants:
         return out
     sigma = np.sqrt(np.diag(information.covariance_of([every_constant(problem)])))
-    steps = np.minimum(_STEP * sigma, _LONGEST_STEP)
     if with_states is None:
         all_rows = list(problem.observation_rows(evaluation))
         given = information.given(constants)
         with_states = by_place(all_rows, covariance_with_states(all_rows, given, constants))
+    wanted = {name: sigma[own] for name, own in problem.columns.items()}
+    for name, slope in gradient_by_name(problem, evaluation, with_states, wanted).items():
+        out[problem.columns[name]] = slope
+    return out
+
+
+def gradient_by_name(
+    problem: Problem,
+    evaluation: Evaluation,
+    with_states: WithStates,
+    wanted: Mapping[str, Array],
+) -> dict[str, Array]:
+    """Return the gradient of log det of the states' information by some constants, by name.
+
+    Parameters
+    ----------
+    problem, evaluation : Problem or Evaluation
+        Those of `log_determinant_gradient`.
+    with_states : dict
+        `by_place` of all rows of observations.
+    wanted : mapping of str to ndarray
+        Standard deviations of the constants, SI, by name: how far differences go.
+    """
+    constants = constants_of(problem)
 
     def total(p: Parameter, value: Array) -> float:
         every = problem.observation_rows_at(evaluation, {p.name: value})
@@ -210,15 +233,23 @@ def log_determinant_gradient(
             return total(p, value)
         return sum(known[b.observation.label] for b in problem.bound if p.name in b.names)
 
+    out = {}
     for p in problem.parameters:
-        if problem.key(p.name) in problem.clock_keys:
+        if p.name not in wanted or problem.key(p.name) in problem.clock_keys:
             continue
-        value, own = evaluation.parameters[p.name], problem.columns[p.name]
+        value, steps = evaluation.parameters[p.name], _steps(wanted[p.name])
         at_value = before(p, value)
-        for i, step in enumerate(np.diag(steps[own])):
-            after = total(p, value @ exp_so3(step) if p.rotation else value + step)
-            out[own.start + i] = 2.0 * (after - at_value) / step[i]
+        after = [
+            total(p, value @ exp_so3(step) if p.rotation else value + step)
+            for step in np.diag(steps)
+        ]
+        out[p.name] = 2.0 * (np.array(after) - at_value) / steps
     return out
+
+
+def _steps(sigma: Array) -> Array:
+    """Return the steps of differences by constants with some standard deviations, SI."""
+    return np.minimum(_STEP * sigma, _LONGEST_STEP)
 
 
 def constants_of(problem: Problem) -> set[int]:

@@ -107,6 +107,13 @@ class Scores:
         std = np.where(known, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.inf)
         return Score(float(self.score[rows] @ step), rows.size, step, std)
 
+    def with_slopes(self, slopes: Mapping[str, Array]) -> Scores:
+        """Return the scores where the objective has slopes that no residual has, by name, 1/SI."""
+        score = self.score.copy()
+        for name, slope in slopes.items():
+            score[self.places[name]] -= slope
+        return replace(self, score=score)
+
     def with_variance(self, variance: Array) -> Scores:
         """Return the scores where their variance is not the information, of each candidate alone.
 

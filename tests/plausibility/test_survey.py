@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from builders import build_trial
 
+from factorgraph_dvl.geometry.rotations import exp_so3
 from factorgraph_dvl.geometry.vectors import Array
 from factorgraph_dvl.plausibility.survey import Survey, survey
 from factorgraph_dvl.quality.finding import Code
@@ -217,6 +218,27 @@ def test_the_sign_is_not_judged_where_the_mounting_is_unknown() -> None:
     )
     trial = replace(trial, dvl=replace(trial.dvl, settings=settings))
     assert survey(trial).problems == ()
+
+
+@pytest.mark.parametrize(
+    ("angle", "text", "severity"),
+    [
+        (20.0, "20 deg to starboard of the bow", "ok"),
+        (-47.0, "47 deg to port of the bow", "note"),
+    ],
+)
+def test_where_the_vehicle_moves_by_the_prior_is_told(
+    angle: float, text: str, severity: str
+) -> None:
+    """A DVL that is turned to port sees the vehicle move to starboard."""
+    trial = build_trial()
+    assert trial.dvl is not None
+    # The body's z points up, so that a positive angle is one to port.
+    velocity = trial.dvl.velocity @ exp_so3(np.array([0.0, 0.0, np.deg2rad(angle)]))
+    found = survey(replace(trial, dvl=replace(trial.dvl, velocity=velocity))).findings
+    (sign,) = (f for f in found if f.code == Code.DVL_SIGN)
+    assert text in sign.text
+    assert sign.severity == severity
 
 
 def first(trial: Trial, n: int) -> Trial:

@@ -17,6 +17,7 @@ from factorgraph_dvl.solvers import known_parameters
 from factorgraph_dvl.solvers.batch import solved_problems
 from factorgraph_dvl.solvers.known_parameters import freed, wide, with_parameters
 from factorgraph_dvl.solvers.levenberg_marquardt import factorized, minimise
+from factorgraph_dvl.statistics.marginal_likelihood import constants_of
 from factorgraph_dvl.statistics.rows import product, rows_by_source
 from factorgraph_dvl.statistics.scores import Scores
 
@@ -79,11 +80,37 @@ def solved(request):
     return problem, evaluation, information, known, (test, at, columns)
 
 
+def slopes_of(test, at, columns):
+    """Return half the change of log det of the states' information by each candidate, by name.
+
+    By differences of the determinant itself.
+    """
+    constants = constants_of(test)
+    out = {}
+    for name, (key, sigma) in columns.items():
+        if key in test.clock_keys:
+            continue
+        slope = []
+        for step in np.diag(np.minimum(1e-3 * sigma, 1e-6)):
+            ends = []
+            for sign in (1.0, 0.0):
+                moved = {**at.parameters, name: at.parameters[name] + sign * step}
+                there = test.evaluate(test.values(at.states, moved))
+                ends.append(factorized(test, there)[0].given(constants).log_determinant)
+            slope.append((ends[0] - ends[1]) / (2.0 * step.max()))
+        out[name] = np.array(slope)
+    return out
+
+
 @pytest.mark.parametrize("longest", [7, 1000])
 def test_they_are_those_of_an_elimination(solved, monkeypatch, longest):
     problem, evaluation, information, known, (test, at, columns) = solved
     of_test, delta = factorized(test, at)
     expected = scores(delta, of_test, columns)
+    if problem.chain.interpolates:
+        slopes = slopes_of(test, at, columns)
+        assert max(np.abs(slopes[name] * columns[name][1]).max() for name in slopes) > 0.1
+        expected = expected.with_slopes(slopes)
     monkeypatch.setattr(known_parameters, "_LONGEST", longest)
     free = freed(problem, evaluation, information, known)
     parts = len(list(free.parts()))
