@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -13,7 +14,7 @@ from factorgraph_dvl.errors import ConfigError
 from factorgraph_dvl.graph.priors import ConstantsPrior
 from factorgraph_dvl.graph.trajectory import TRAJECTORY_RATE
 from factorgraph_dvl.plausibility.survey import accepted_errors, explained, survey
-from factorgraph_dvl.quality.finding import Finding
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.quality.results import ambiguity
 from factorgraph_dvl.ranging.hypothesis_weights import significant_costs
 from factorgraph_dvl.solution import Progress, Solution
@@ -67,7 +68,9 @@ def solve(
         Time between the states of the graph, s; less where the noise of the gyros in between
         matters to a sensor of attitude. Without an IMU states are at pings.
     anyway : bool, optional
-        Solve although there are records that cannot be used.
+        Solve although there are records that cannot be used, or that contradict each other. By
+        default, noise and what else the data show are not asked for where records contradict each
+        other: the result is not to be used.
     progress : callable, optional
         Called with stage, iteration and cost (None where there is none yet).
 
@@ -123,9 +126,16 @@ def solve_with_problem(
     errors = accepted_errors(records, anyway=anyway)
     with explained(errors):
         prepared = _prepared(trial, state_interval_s, report)
-        found, solved = _most_probable(trial, prepared, rate_hz, report)
+        roughly = not anyway and _contradict(errors)
+        found, solved = _most_probable(trial, prepared, rate_hz, report, roughly=roughly)
     kept = without_hidden(errors, trial.aids, found.estimates)
     return found.with_findings(kept), solved
+
+
+def _contradict(errors: Iterable[Finding]) -> bool:
+    """Whether records contradict each other, whatever is found later."""
+    # A delay may be that of a window.
+    return any(f.severity == "error" and f.code != Code.CLOCK_OFFSET for f in errors)
 
 
 def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepared:
@@ -138,12 +148,12 @@ def _prepared(trial: Trial, state_interval_s: float, report: Progress) -> Prepar
 
 
 def _most_probable(
-    trial: Trial, prepared: Prepared, rate_hz: float, report: Progress
+    trial: Trial, prepared: Prepared, rate_hz: float, report: Progress, *, roughly: bool
 ) -> tuple[Solution, SolvedProblem]:
     """Return the most probable of all minima from all positions, with the spread of the others."""
     solutions, best = [], []
     for states in prepared.start_positions.states:
-        minima = _minima(prepared, states, prepared.findings, report)
+        minima = _minima(prepared, states, prepared.findings, report, roughly=roughly)
         if isinstance(prepared, PlanarPreparation):
             solutions.append(_along_arc(trial, prepared, minima[0], rate_hz, report))
         else:
@@ -214,9 +224,11 @@ def _minima(
     states: Any,
     findings: tuple[Finding, ...],
     report: Progress,
+    *,
+    roughly: bool = False,
 ) -> list[SolvedProblem]:
     """Return the minima near some states and their rivals, the most probable first."""
-    found = competing_minima(prepared, states, report)
+    found = competing_minima(prepared, states, report, roughly=roughly)
     return distinct(prepared, [_with_covariances(each, findings, report) for each in found])
 
 

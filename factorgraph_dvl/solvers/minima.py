@@ -44,7 +44,9 @@ _SAME_ANGLE = 15.0 * DEG
 _IMPOSSIBLE = 15.0
 
 
-def competing_minima(prepared: Prepared, states: Any, report: Progress) -> list[SettledMinimum]:
+def competing_minima(
+    prepared: Prepared, states: Any, report: Progress, *, roughly: bool = False
+) -> list[SettledMinimum]:
     """Return the minimum that some states lead to, then others that are about as probable.
 
     In some seconds neither heading nor mounting is known before the DVL is used, and start
@@ -59,13 +61,15 @@ def competing_minima(prepared: Prepared, states: Any, report: Progress) -> list[
         Where to start, as the chain has it.
     report : callable
         Called with stage, iteration and cost.
+    roughly : bool, default False
+        Whether records contradict each other: that of `settle`.
     """
-    first = settle(prepared, states, report)
+    first = settle(prepared, states, report, roughly=roughly)
     rotations = [p for p in prepared.parameters if p.rotation and p.estimated]
     time = first.problem.chain.node_time
     is_free = any(p.sigma.max() > _ANY_ANGLE for p in rotations)
     long = time[-1] - time[0] > _SHORT
-    if long or not is_free or not isinstance(prepared, Preparation):
+    if roughly or long or not is_free or not isinstance(prepared, Preparation):
         return [first]
     report("other mountings", 0, None)
     out = [first]

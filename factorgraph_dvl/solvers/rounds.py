@@ -119,7 +119,8 @@ def settle(
     clock_zero : float, optional
         Reference time of the clock offsets, s; by default in the middle of the trial.
     roughly : bool, default False
-        Whether another trial starts from there: it asks anew what else the data show.
+        Whether what else the data show is not asked for: another trial starts from there, or
+        records contradict each other, and all else would explain a part of that.
     """
     start, iterations = _start(prepared, states, report, constants_prior, values, clock_zero)
     at = _first(start, report)
