@@ -16,6 +16,7 @@ from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.files.solution_folder import save_solution
 from factorgraph_dvl.files.trial_folder import load_trial
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.verdict import verdict_of
 
 REASON = "DVL velocity: residuals are 14 times as large as stated"
 REFUSAL = f"graded `do not use`: {REASON}"
@@ -113,11 +114,23 @@ def test_the_conclusion_leaves_room_on_a_screen(
     assert lines[0].startswith("Verdict: doubtful: reason 0")
     assert "Further reasons: 9" in lines[0]
     assert [line for line in lines if "reason" in line][1:] == [
-        f"warning: reason {i}" for i in (1, 2)
+        f"warning: reason {i}." for i in (1, 2)
     ]
     assert ("Mount and compass: the sum" in lines) == has_sum
     assert any("Delph XV3" in line for line in lines)
     assert lines[-1] == "Open out/report.html"
+
+
+def test_what_to_do_about_further_reasons_is_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    codes = (Code.DOES_NOT_FIT, Code.OUTLIERS, Code.OUTLIERS)
+    reasons = [Finding(c, f"reason {i}", severity="warning") for i, c in enumerate(codes)]
+    order = [f.code for f in verdict_of(reasons).reasons]
+    print_conclusion(replace(condemned(), findings=tuple(reasons)), "", Path("out/report.html"))
+    lines = [line for line in capsys.readouterr().out.splitlines() if "reason" in line]
+    assert len(lines) == len(codes)
+    for code in set(codes):
+        assert sum(code.action in line for line in lines) == 1
+    assert lines[1].endswith(order[1].action) == (order[1] != order[0])
 
 
 def test_instrument_says_why_nothing_is_to_be_entered(folder: Path, run: Run) -> None:
