@@ -14,8 +14,10 @@ from truth import CONING, config, scenario
 from factorgraph_dvl.analysis.error_statistics import calibration_errors, trajectory_errors
 from factorgraph_dvl.errors import ConfigError, DataError
 from factorgraph_dvl.geometry.units import DEG
-from factorgraph_dvl.quality.finding import Code
+from factorgraph_dvl.plausibility.survey import survey
+from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.simulation import simulate
+from factorgraph_dvl.solvers import batch, steps
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.solvers.minima import most_probable_minimum
 
@@ -359,3 +361,34 @@ def test_minima_that_the_data_do_not_tell_apart_are_mixed():
     (text,) = of_code(both.findings, Code.AMBIGUOUS)
     assert "2 minima" in text
     assert "0.73, 0.27" in text
+
+
+@pytest.mark.parametrize(
+    ("code", "severity", "anyway", "asked"),
+    [
+        (Code.FORCE_UNIT, "error", False, False),
+        (Code.FORCE_UNIT, "error", True, True),
+        # A window may explain a delay, and a warning contradicts nothing.
+        (Code.CLOCK_OFFSET, "error", False, True),
+        (Code.COURSE, "warning", False, True),
+    ],
+)
+def test_records_that_contradict_each_other_are_solved_to_the_first_minimum(
+    monkeypatch, code, severity, anyway, asked
+):
+    trial = simulate(scenario(manoeuvres=[{"straight_s": 65}]), 1)
+    found = Finding(code, "a contradiction", "IMU", severity=severity)
+    before = survey(trial)
+    monkeypatch.setattr(
+        batch, "survey", lambda trial: replace(before, findings=(*before.findings, found))
+    )
+    calls = []
+
+    def explanation(problem, minimum, imu):
+        calls.append(imu)
+
+    monkeypatch.setattr(steps, "explanation", explanation)
+    solution = solve(trial, anyway=anyway)
+    assert bool(calls) == asked
+    assert found in solution.verdict.reasons
+    assert solution.verdict.grade == ("do not use" if severity == "error" else "doubtful")
