@@ -72,7 +72,7 @@ def print_conclusion(solution: Solution, maker: str, page: Path) -> None:
         for reason in solution.verdict.reasons[1:_REASONS]:
             action = "" if reason.code in said else f" {reason.code.action}"
             said.add(reason.code)
-            line = f"{reason.severity}: {sentence(str(reason))}{action}"
+            line = f"{reason.severity}: {sentence(printable(str(reason)))}{action}"
             stdout().print(line, markup=False, soft_wrap=True)
         if both is not None:
             stdout().print(f"Mount and compass: {both}", markup=False, soft_wrap=True)

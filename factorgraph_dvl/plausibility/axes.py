@@ -112,6 +112,12 @@ def off_course(directions: BodyDirections, body_axes: BodyAxes) -> float | None:
     return float(np.arctan2(starboard, forward))
 
 
+def side_of_bow(angle: float) -> Message:
+    """Return in words how far a course is to starboard of the bow, from rad."""
+    side = "course.starboard" if angle > 0.0 else "course.port"
+    return message(side, angle=abs(angle) / DEG)
+
+
 def axes_that_fit(directions: BodyDirections) -> list[BodyAxes]:
     """Return the `body_axes` with which the bow points along the course, and up is up."""
     if directions.course is None:

@@ -36,6 +36,7 @@ from factorgraph_dvl.plausibility.axes import (
     in_words,
     off_course,
     relabelling,
+    side_of_bow,
 )
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS, clock_findings, far_clock_finding
 from factorgraph_dvl.plausibility.dvl import mirrored_finding
@@ -418,16 +419,12 @@ def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterato
     upright = -frd_from_body(body_axes)[2] @ directions.up > 0.7
     if angle is None or not upright or abs(angle) < _OFF_COURSE:
         return
-    degrees = angle / DEG
     fit = [axes for axes in axes_that_fit(directions) if axes != body_axes]
     cause = message("course.turned_imu")
     if fit:
         cause = message("course.other_axes", axes=either(fit))
-    if abs(degrees) > 150.0:
-        where = message("course.astern")
-    else:
-        side = "course.starboard" if degrees > 0 else "course.port"
-        where = message(side, angle=abs(degrees))
+    astern = abs(angle) > 150.0 * DEG
+    where = message("course.astern") if astern else side_of_bow(angle)
     yield Finding(
         Code.COURSE,
         message("course.moves", axes=body_axes, where=where, cause=cause),

@@ -11,7 +11,7 @@ from factorgraph_dvl.geometry.units import DEG
 from factorgraph_dvl.geometry.vectors import Array, interpolate
 from factorgraph_dvl.initialization.dvl_windows import DvlFit
 from factorgraph_dvl.message import Message, either, message
-from factorgraph_dvl.plausibility.axes import in_words, mirrored, swapped
+from factorgraph_dvl.plausibility.axes import in_words, mirrored, side_of_bow, swapped
 from factorgraph_dvl.plausibility.gnss import MOVING_M_S, RADIANS, SPEED_UNITS
 from factorgraph_dvl.plausibility.records import WINDOW_S, covered, gnss_velocity
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -157,10 +157,9 @@ def _sign_findings(
         )
     elif ahead > 0.5:
         angle = float(np.arctan2(starboard, ahead))
-        side = "course.starboard" if angle > 0.0 else "course.port"
         yield Finding(
             Code.DVL_SIGN,
-            message("dvl_sign.ahead", where=message(side, angle=abs(angle) / DEG)),
+            message("dvl_sign.ahead", where=side_of_bow(angle)),
             dvl.label,
             severity="ok" if abs(angle) < _KNOWN else "note",
         )

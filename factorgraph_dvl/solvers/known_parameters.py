@@ -30,10 +30,9 @@ from factorgraph_dvl.solvers.sawtooth import sawtooths
 from factorgraph_dvl.solvers.shape import Shape, Shapes, searched
 from factorgraph_dvl.solvers.water_span import water_spans
 from factorgraph_dvl.statistics.marginal_likelihood import (
-    by_place,
     constants_of,
-    covariance_with_states,
     gradient_by_name,
+    with_states_at,
 )
 from factorgraph_dvl.statistics.robust_weights import robust_scale
 from factorgraph_dvl.statistics.rows import rows_by_source
@@ -533,8 +532,7 @@ def _slopes(
     columns : mapping of str to tuple of (int, ndarray)
         The parameters: that of `ParameterScores`.
     """
-    every, constants = list(problem.observation_rows(evaluation)), constants_of(problem)
-    with_states = by_place(every, covariance_with_states(every, given, constants))
+    with_states = with_states_at(problem, evaluation, given)
     wide = {name: sigma for name, (_, sigma) in columns.items()}
     found = gradient_by_name(problem, evaluation, with_states, wide)
     return {name: 0.5 * slope for name, slope in found.items()}

@@ -483,10 +483,11 @@ def _different(now: Explanation | None, at_first: Explanation | None) -> list[Ex
 def _freeing(cause: Explanation, at: Estimated) -> Iterator[Proposal]:
     """Yield what estimates a parameter instead, with noise as stated and as found."""
     freed = _with_others(at, *cause.freed)
-    # What the misfit made of noise and gross errors is to be found anew. Without an IMU, strengths
-    # follow any change of the parameters.
-    for model in (freed,) if freed.chain.interpolates else (freed.as_stated(), freed):
-        yield Proposal(model, at.states, at.values, price=cause.price)
+    if not freed.chain.interpolates:
+        # What the misfit made of noise and gross errors is to be found anew. Without an IMU,
+        # strengths follow any change of the parameters.
+        yield Proposal(freed.as_stated(), at.states, at.values, price=cause.price)
+    yield Proposal(freed, at.states, at.values, price=cause.price)
 
 
 def _with_others(at: Estimated, *others: Parameter) -> Model:

@@ -189,9 +189,7 @@ def log_determinant_gradient(
         return out
     sigma = np.sqrt(np.diag(information.covariance_of([every_constant(problem)])))
     if with_states is None:
-        all_rows = list(problem.observation_rows(evaluation))
-        given = information.given(constants)
-        with_states = by_place(all_rows, covariance_with_states(all_rows, given, constants))
+        with_states = with_states_at(problem, evaluation, information.given(constants))
     wanted = {name: sigma[own] for name, own in problem.columns.items()}
     for name, slope in gradient_by_name(problem, evaluation, with_states, wanted).items():
         out[problem.columns[name]] = slope
@@ -237,7 +235,8 @@ def gradient_by_name(
     for p in problem.parameters:
         if p.name not in wanted or problem.key(p.name) in problem.clock_keys:
             continue
-        value, steps = evaluation.parameters[p.name], _steps(wanted[p.name])
+        value = evaluation.parameters[p.name]
+        steps = np.minimum(_STEP * wanted[p.name], _LONGEST_STEP)
         at_value = before(p, value)
         after = [
             total(p, value @ exp_so3(step) if p.rotation else value + step)
@@ -245,11 +244,6 @@ def gradient_by_name(
         ]
         out[p.name] = 2.0 * (np.array(after) - at_value) / steps
     return out
-
-
-def _steps(sigma: Array) -> Array:
-    """Return the steps of differences by constants with some standard deviations, SI."""
-    return np.minimum(_STEP * sigma, _LONGEST_STEP)
 
 
 def constants_of(problem: Problem) -> set[int]:
@@ -287,6 +281,14 @@ def covariance_with_states(
 def by_place(every: Sequence[Rows], with_states: Sequence[Array]) -> WithStates:
     """Return rows with their `covariance_with_states` by source and number of the first item."""
     return {(r.source, r.begin): (r, each) for r, each in zip(every, with_states, strict=True)}
+
+
+def with_states_at(
+    problem: Problem, evaluation: Evaluation, given: SquareRootInformation
+) -> WithStates:
+    """Return `by_place` of all rows of observations, from the information given the constants."""
+    every, constants = list(problem.observation_rows(evaluation)), constants_of(problem)
+    return by_place(every, covariance_with_states(every, given, constants))
 
 
 def leverage_of(
