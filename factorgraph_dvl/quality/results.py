@@ -176,6 +176,19 @@ def _impossible_scale(e: Estimate) -> list[Finding]:
     return [Finding(Code.IMPOSSIBLE_SCALE, text, parameter=e.name)]
 
 
+def is_far_from_prior(e: Estimate, value: Array) -> bool:
+    """Whether a parameter would be far from its prior if it had another value, (n,)."""
+    _, apart = _apart(e, value)
+    return bool(np.max(apart, initial=0.0) > _FAR_FROM_PRIOR)
+
+
+def _apart(e: Estimate, value: Array) -> tuple[BoolArray, Array]:
+    """Return which components the data inform on, and by how many σ those are off their priors."""
+    informed = e.std < _INFORMED * e.prior_std
+    moved = np.abs(value - e.prior_value)[informed]
+    return informed, moved / np.sqrt((e.prior_std**2 - e.std**2)[informed])
+
+
 def _far_from_prior(e: Estimate) -> list[Finding]:
     """Return a finding if a component is far from its prior, by the data alone.
 
@@ -187,15 +200,14 @@ def _far_from_prior(e: Estimate) -> list[Finding]:
     plausible = e.spec.plausible is not None and np.allclose(e.prior_std, e.spec.plausible)
     if e.spec.usual or plausible:
         return []
-    informed = e.std < _INFORMED * e.prior_std
+    informed, apart = _apart(e, e.value)
     if not informed.any():
         return []
-    moved = np.abs(e.value - e.prior_value)[informed]
-    rest = (e.prior_std**2 - e.std**2)[informed]
-    apart = moved / np.sqrt(rest)
     worst = int(np.argmax(apart))
     if not apart[worst] > _FAR_FROM_PRIOR:
         return []
+    moved = np.abs(e.value - e.prior_value)[informed]
+    rest = (e.prior_std**2 - e.std**2)[informed]
     mean, prior_std, std = (x[informed][worst] for x in (e.prior_value, e.prior_std, e.std))
     gain = prior_std**2 / rest[worst]
     alone = mean + gain * (e.value[informed][worst] - mean)

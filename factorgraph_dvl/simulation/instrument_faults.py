@@ -77,7 +77,10 @@ def dvl_scale_by_speed(per_m_s: float) -> Fault:
 
 
 def dvl_averages(length_s: float) -> Fault:
-    """Give for each ping the mean of those in a window about it."""
+    """Give for each ping the mean of those in a window about it.
+
+    The mean of n pings is that over a window whose times have the same variance.
+    """
 
     def fault(trial: Trial, rng: np.random.Generator) -> Trial:
         dvl = record_of(trial, "dvl")
@@ -85,7 +88,10 @@ def dvl_averages(length_s: float) -> Fault:
         last = np.searchsorted(dvl.time, dvl.time + 0.5 * length_s, side="right")
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(dvl.velocity, axis=0)])
         velocity = (sums[last] - sums[first]) / (last - first)[:, None]
-        return with_arrays(trial, "dvl", velocity=velocity)
+        count, interval = np.median(last - first), np.median(np.diff(dvl.time))
+        length = interval * np.sqrt(count**2 - 1.0)
+        truth = trial.calibration_truth | {"averaging_s": np.array([length])}
+        return replace(with_arrays(trial, "dvl", velocity=velocity), calibration_truth=truth)
 
     return fault
 

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from factorgraph_dvl.estimates import Estimate
+from factorgraph_dvl.geometry.vectors import Array, IntArray
+from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
+from factorgraph_dvl.quality.results import is_far_from_prior
 from factorgraph_dvl.sensors.imu import BIASES, ERRORS
 from factorgraph_dvl.sensors.parameters import UNITS, Parameter
+from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
+from factorgraph_dvl.solvers.record_scores import in_all, record_sums_in_turn
 from factorgraph_dvl.statistics.constancy import Change, changes
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
+from factorgraph_dvl.statistics.scores import Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations from which on a change is one. Chosen: the probability by chance is below
@@ -25,6 +31,8 @@ from factorgraph_dvl.statistics.square_root_information import SquareRootInforma
 CHANGED = 5.0
 # Cost up to which a change is as probable as the most probable one. Chosen: a likelihood of e^-4.
 _TIE = 4.0
+# Name of a change of a parameter, beside the parameter itself.
+_CHANGE = "change"
 # Name of what a minimum keeps.
 _CHANGES = "changes along the trial"
 
@@ -116,6 +124,95 @@ def changes_at(
     return list(minimum.kept[_CHANGES])
 
 
+def fall_of_change(problem: Problem, minimum: Minimum) -> float:
+    """Return what the objective falls by, about, if a parameter changed once; 0 if none did.
+
+    Where it is a parameter of measurements, all else follows the change, states before and after
+    it apart: what follows a parameter of the whole trial, as a heading, may follow no change.
+
+    Parameters
+    ----------
+    problem, minimum : Problem or Minimum
+        Problem, and its minimum.
+    """
+    found = [t for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
+    if not found:
+        return 0.0
+    best = max(found, key=lambda t: t.change.fall)
+    name, evaluation = best.parameter.name, minimum.evaluation
+    unknown = {_CHANGE: np.full(best.parameter.mean.size, np.inf)}
+
+    def after(_: IntArray, part: BoundObservation, motion: Motion) -> dict[str, Array]:
+        processes = problem.processes_of(part)
+        lin = part.linearized(motion, evaluation.parameters, [name], processes)
+        late = part.observation.time > best.change.time
+        return {_CHANGE: lin.d_parameters[name] * late[:, None, None]}
+
+    sums = [
+        record_sums_in_turn(problem, bound, evaluation, unknown, after)
+        for bound in problem.bound
+        if name in bound.observation.parameters
+    ]
+    if not sums:
+        return best.change.fall
+    whole = in_all(sums)
+    known = whole.square - minimum.information.covariance_of([whole.by_key])
+    scores = Scores(places_of(unknown), whole.score, known, unknown[_CHANGE])
+    return max(best.change.fall, scores.test([_CHANGE]).chi2)
+
+
+def _most_probable(
+    tests: Sequence[ComponentChange], estimates: Iterable[Estimate]
+) -> tuple[ComponentChange, list[ComponentChange]] | None:
+    """Return the change that is named, and those about as probable; None if there is none."""
+    std = {n: s for e in estimates for n, s in zip(e.component_names, e.std, strict=True)}
+    significant = [
+        t
+        for t in tests
+        if t.change.chi2 >= CHANGED**2
+        and (t.parameter.name in BIASES or std[t.name] < abs(t.change.size))
+    ]
+    if not significant:
+        return None
+    largest = max(t.change.fall for t in significant)
+    ties = [t for t in significant if largest - t.change.fall < 2.0 * _TIE]
+    # Of what is about as probable, what the trial is for.
+    best = min(ties, key=lambda t: (t.parameter.spec.nuisance, -t.change.fall))
+    return best, [t for t in ties if t is not best]
+
+
+def without_explained(
+    findings: Iterable[Finding], found: SolvedProblem, estimates: Sequence[Estimate]
+) -> list[Finding]:
+    """Return findings less those of parameters that would not be far from their priors.
+
+    That is where what changes along the trial is free to: it moves the others as far.
+
+    Parameters
+    ----------
+    findings : iterable of Finding
+        All that there are.
+    found : SolvedProblem
+        Problem at its minimum, with covariances.
+    estimates : sequence of Estimate
+        What is reported of each parameter.
+    """
+    tests = changes_at(found.problem, found.minimum)
+    change = _most_probable(tests, estimates)
+    if change is None:
+        return list(findings)
+    shift = {t.name: by for t, by in zip(tests, change[0].change.shift, strict=True)}
+    explained = {
+        e.name
+        for e in estimates
+        if e.name != change[0].parameter.name
+        and not is_far_from_prior(e, e.value + [shift.get(n, 0.0) for n in e.component_names])
+    }
+    return [
+        f for f in findings if not (f.code == Code.FAR_FROM_PRIOR and f.parameter in explained)
+    ]
+
+
 def change_findings(
     found: SolvedProblem,
     every: Iterable[Rows],
@@ -142,21 +239,11 @@ def change_findings(
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     """
-    tests = changes_at(found.problem, found.minimum, every)
-    std = {n: s for e in estimates for n, s in zip(e.component_names, e.std, strict=True)}
-    significant = [
-        t
-        for t in tests
-        if t.change.chi2 >= CHANGED**2
-        and (t.parameter.name in BIASES or std[t.name] < abs(t.change.size))
-    ]
-    if not significant:
+    found_change = _most_probable(changes_at(found.problem, found.minimum, every), estimates)
+    if found_change is None:
         return
-    largest = max(t.change.fall for t in significant)
-    ties = [t for t in significant if largest - t.change.fall < 2.0 * _TIE]
-    # Of what is about as probable, what the trial is for.
-    best = min(ties, key=lambda t: (t.parameter.spec.nuisance, -t.change.fall))
-    ties.remove(best)
+    tests = changes_at(found.problem, found.minimum)
+    best, ties = found_change
     change = best.change
     unit = UNITS[best.parameter.spec.unit].text
     others: Message | str = ""

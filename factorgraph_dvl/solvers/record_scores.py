@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
@@ -25,6 +25,9 @@ _CHUNK = 4096
 _ENOUGH, _STRETCHES = 10_000, 20
 # Time between values that show a curvature, s. Chosen: they are the mean over 0.3 s within 2 %.
 _BETWEEN = 0.1
+# Means that are tried, and the longest of them over the length that curvature shows. Chosen: a
+# motion within which a window holds whole periods looks as if it were a third as long.
+_MEANS, _LONGEST = 20, 4.0
 # Standard deviations from which on a misfit is one. Chosen: seldom by chance.
 _CERTAIN = 3.0
 
@@ -151,15 +154,21 @@ def record_sums_in_turn(
     derivatives : callable, optional
         Returns derivatives of some rows by the parameters, in place of those of the observation.
     """
-    size = sum(sigma.size for sigma in candidates.values())
-    score, square, by_key = np.zeros(size), np.zeros((size, size)), dict[int, Array]()
+    every = []
     for some in _in_turn(bound.observation.time.size):
         part, motion = part_of(problem, bound, some, evaluation)
         own = {} if derivatives is None else derivatives(some, part, motion)
-        sums = record_sums(problem, part, evaluation, candidates, motion, own)
-        score, square = score + sums.score, square + sums.square
-        for key, rows in sums.by_key.items():
+        every.append(record_sums(problem, part, evaluation, candidates, motion, own))
+    return in_all(every)
+
+
+def in_all(every: Sequence[RecordSums]) -> RecordSums:
+    """Return the sums of several parts, or records, of the same parameters."""
+    by_key: dict[int, Array] = {}
+    for each in every:
+        for key, rows in each.by_key.items():
             by_key[key] = by_key[key] + rows if key in by_key else rows
+    score, square = (np.sum([getattr(e, n) for e in every], axis=0) for n in ("score", "square"))
     return RecordSums(score, square, by_key)
 
 
@@ -249,6 +258,57 @@ def by_square(
     out /= 24.0 * _BETWEEN**2
     out[~covered] = 0.0
     return out[:, :, None]
+
+
+def by_lengths(
+    problem: Problem,
+    bound: BoundObservation,
+    motion: Motion,
+    evaluation: Evaluation,
+    length: float,
+) -> tuple[Array, Array]:
+    """Return lengths about one, s, and what means over them change of measurements.
+
+    Means are those of the trapezoidal rule; ends of the trial, which they pass, do not change.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem without the window.
+    bound : BoundObservation
+        The observation, or some of its measurements, attached.
+    motion : Motion
+        Motion where it is attached.
+    evaluation : Evaluation
+        The minimum.
+    length : float
+        Length, s.
+
+    Returns
+    -------
+    lengths : ndarray, shape (n,), s
+        Lengths, ascending.
+    changes : ndarray, shape (M, d, n)
+        Means less what they are means of.
+    """
+    values, chain = evaluation.parameters, bound.chain
+    time, shift = bound.times(values), chain.shift(values)
+    processes = problem.processes_of(bound)
+    middle = bound.residual(motion, values, processes)
+    ends, total = [middle, middle], np.zeros_like(middle)
+    covered = np.ones(time.size, dtype=bool)
+    step = 0.5 * _LONGEST * length / _MEANS
+    out = np.zeros((*middle.shape, _MEANS))
+    for k in range(1, _MEANS + 1):
+        for side, sign in enumerate((-1.0, 1.0)):
+            when = time + sign * k * step
+            there = bound.motion(chain.attach(when, shift), evaluation.states, values)
+            end = bound.residual(there, values, processes)
+            total += 0.5 * (ends[side] + end)
+            ends[side] = end
+            covered &= chain.covers(when)
+        out[covered, :, k - 1] = (total / (2.0 * k) - middle)[covered]
+    return np.arange(1.0, _MEANS + 1.0) * 2.0 * step, out
 
 
 def by_noise(problem: Problem, bound: BoundObservation, evaluation: Evaluation) -> Array:

@@ -154,6 +154,9 @@ def settle(
             changed = changed or step.name
             fall, move = recorded.objective - found.objective, found.moved_from(recorded)
             going_on = found.rough or fall > _SAME_OBJECTIVE or move > _SAME_CONSTANTS
+            if known.first is at and isinstance(step, (Averaging, States)):
+                # Noise is as stated still, and nothing left out.
+                known.first = found
             at = found
             if not found.rough:
                 if recorded.rough and changed == States.name:

@@ -23,7 +23,7 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
+from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at, fall_of_change
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     noise_of,
@@ -206,13 +206,11 @@ class Averaging:
         if self._tested.before(model.parameters) or at.rough or at.problem.chain.interpolates:
             return
         self._tested.note(model.parameters)
-        found = shown_windows(at.problem, at.minimum)
-        if not found:
-            return
-        freed = (wide(p, p.mean) for p in model.parameters if p.name in found)
-        there = {**at.values, **found}
-        changed = replace(_with_others(at, *freed), reference=(at.states, there))
-        yield Proposal(changed, at.states, there)
+        for name, length in shown_windows(at.problem, at.minimum).items():
+            (freed,) = (wide(p, p.mean) for p in model.parameters if p.name == name)
+            there = {**at.values, name: length}
+            changed = replace(_with_others(at, freed), reference=(at.states, there))
+            yield Proposal(changed, at.states, there)
 
 
 class GrossErrors:
@@ -245,8 +243,14 @@ class GrossErrors:
             # Where gross errors were taken for noise, only both together lower the objective.
             factors = noise_of_the_rest(problem, there, weights)
             changed = replace(model, robust_weights=weights)
+            price = 0.0
+            if not model.robust_weights:
+                # What changed once would be a gross error ever after.
+                problem.robust_weights = {}
+                problem.weigh(evaluation)
+                price = fall_of_change(problem, at.minimum)
             for each in (changed, replace(changed, noise_factors=factors)):
-                yield Proposal(each, there.states, there.parameters)
+                yield Proposal(each, there.states, there.parameters, price=price)
 
 
 class Correlation:

@@ -26,8 +26,9 @@ from factorgraph_dvl.quality.results import (
 )
 from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solution import Solution
+from factorgraph_dvl.solvers.averaging import noise_of_means
 from factorgraph_dvl.solvers.calibration import calibration
-from factorgraph_dvl.solvers.change_along_trial import change_findings
+from factorgraph_dvl.solvers.change_along_trial import change_findings, without_explained
 from factorgraph_dvl.solvers.correlated_noise import noise_of
 from factorgraph_dvl.solvers.error_budget import causes
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
@@ -65,7 +66,8 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
         text = message(key, count=count)
         findings.append(Finding(Code.UNUSED, text, sensor=label))
     noise = noise_of(problem)
-    findings += consistency_findings(estimates, residuals, noise)
+    of_residuals = consistency_findings(estimates, residuals, noise)
+    findings += noise_of_means(of_residuals, found.findings)
     findings += prior_findings(trial, estimates, covariance)
     findings += mostly_rejected(residuals, [r for r in rejected if r.reason == "echo"])
     findings += outlier_findings(residuals, [r for r in rejected if r.reason != "echo"])
@@ -74,7 +76,7 @@ def summarise(trial: Trial, found: SolvedProblem, *, rate_hz: float) -> Solution
     error_budget = causes(
         found, lambda rows: changes.extend(change_findings(found, rows, estimates, trial.limits))
     )
-    findings += changes
+    findings = without_explained(findings, found, estimates) + changes
     findings += _unobservable(trial, problem, estimates, evaluation.motions)
     findings += heading_and_misalignment(trial, found)
     findings += grid_north_findings(trial, estimates)

@@ -18,9 +18,11 @@ from factorgraph_dvl.plausibility.clocks import clock_findings
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.quality.results import windows_left_out
 from factorgraph_dvl.simulation import parse_scenario, simulate
+from factorgraph_dvl.simulation.faults import with_faults
+from factorgraph_dvl.simulation.instrument_faults import dvl_averages
 from factorgraph_dvl.solvers.averaging import without_hidden
 from factorgraph_dvl.solvers.batch import solve, solved_problems
-from factorgraph_dvl.solvers.record_scores import by_square
+from factorgraph_dvl.solvers.record_scores import by_lengths, by_square
 
 SWELL_HZ = 0.3
 
@@ -110,6 +112,22 @@ def test_a_long_window_is_no_contradiction():
     found = solve(trial_of(2.0, 1))
     assert found.estimate("averaging_s").value[0] == pytest.approx(2.0, abs=0.02)
     assert not {Code.FAR_FROM_PRIOR} & {f.code for f in found.findings}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("length_s", [1.0, 3.0])
+def test_a_mean_of_pings_is_found_by_its_shape(length_s):
+    """Its noise persists, which is more of the misfit than what the window hides of the swell."""
+    trial = with_faults(trial_of(0.0, 3), [dvl_averages(length_s)])
+    found = solve(trial, rate_hz=1.0)
+    length = found.estimate("averaging_s")
+    truth = trial.calibration_truth["averaging_s"][0]
+    assert abs(length.value[0] - truth) < 4.0 * length.std[0] + 0.002
+    assert length.std[0] < 0.05
+    assert nees_of(found, trial) < chi2.ppf(0.999, 7)
+    assert found.verdict.grade != "do not use"
+    (noise,) = (f for f in found.findings if f.code == Code.SMALL_RESIDUALS)
+    assert noise.severity == "note"
 
 
 def estimated_window(length_s):
@@ -262,6 +280,13 @@ def test_the_square_of_a_window_changes_what_is_predicted_as_the_window_does():
         assert np.vdot(found, expected) == pytest.approx(np.vdot(expected, expected), rel=0.04)
         assert np.linalg.norm(found - expected) < 0.2 * np.linalg.norm(expected)
         checked += 1
+        lengths, changes = by_lengths(problem, bound, motion, evaluation, 0.3)
+        i = int(np.argmin(np.abs(lengths - 0.3)))
+        assert lengths[i] == pytest.approx(0.3)
+        whole = means[1] - means[0]
+        assert changes[inside, :, i] == pytest.approx(
+            whole[inside], abs=0.1 * float(np.abs(whole).max())
+        )
     assert checked == 2
 
 

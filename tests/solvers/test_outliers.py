@@ -14,6 +14,9 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, simulate
 from factorgraph_dvl.solvers.batch import solve
+from factorgraph_dvl.solvers.change_along_trial import fall_of_change
+from factorgraph_dvl.solvers.preparation import prepare
+from factorgraph_dvl.solvers.rounds import settle
 
 CASES = {
     "pings": [faults.dvl_outliers()],
@@ -81,6 +84,32 @@ def test_a_clean_trial_loses_nothing(clean):
     solution = solve(clean, rate_hz=1.0)
     assert not solution.rejected
     assert not any(f.code == Code.OUTLIERS for f in solution.findings)
+
+
+def test_a_mount_that_slips_makes_no_gross_errors(clean):
+    """All pings after it are as wrong as gross errors are, and alike."""
+    solution = solve(faults.with_faults(clean, [faults.dvl_slipped((0.0, 0.0, 2.0))]), rate_hz=1.0)
+    first = solution.verdict.reasons[0]
+    assert (first.code, first.parameter) == (Code.CHANGED_ALONG_TRIAL, "misalignment_deg")
+    assert not solution.rejected
+
+
+def test_what_a_change_takes_off_is_what_it_added(clean):
+    """The test of a change, where all else follows it as that of a whole trial, finds less."""
+    found = []
+    for degrees in (0.0, 0.3):
+        trial = faults.with_faults(clean, [faults.dvl_slipped((0.0, 0.0, degrees))])
+        prepared = prepare(trial, 1.0, lambda *_: None)
+        states = prepared.start_positions.states[0]
+        found.append(settle(prepared, states, lambda *_: None, roughly=True))
+    honest, slipped = found
+    assert not honest.problem.robust_weights
+    assert not slipped.problem.robust_weights
+    added = 2.0 * (slipped.minimum.evaluation.cost - honest.minimum.evaluation.cost)
+    assert added > 100.0
+    taken = fall_of_change(slipped.problem, slipped.minimum)
+    assert taken == pytest.approx(added, rel=0.1)
+    assert fall_of_change(honest.problem, honest.minimum) == 0.0
 
 
 def test_one_beam_is_left_out_alone():
