@@ -124,21 +124,32 @@ def changes_at(
     return list(minimum.kept[_CHANGES])
 
 
-def fall_of_change(problem: Problem, minimum: Minimum) -> float:
-    """Return what the objective falls by, about, if a parameter changed once; 0 if none did.
+def fall_of_change(
+    problem: Problem, minimum: Minimum, robust_weights: Mapping[str, Array]
+) -> float:
+    """Return what the objective falls by, about, if a parameter changed once in place of errors.
 
+    That is 0 where none did, and where gross errors are not most of what is before or after it.
     Where it is a parameter of measurements, all else follows the change, states before and after
     it apart: what follows a parameter of the whole trial, as a heading, may follow no change.
 
     Parameters
     ----------
     problem, minimum : Problem or Minimum
-        Problem, and its minimum.
+        Problem with all measurements, and its minimum.
+    robust_weights : mapping of str to ndarray
+        Weights of measurements, 0 of gross errors, by label.
     """
     found = [t for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
     if not found:
         return 0.0
     best = max(found, key=lambda t: t.change.fall)
+    if not any(
+        _most_of_a_side(bound.observation.time, robust_weights[bound.observation.label], best)
+        for bound in problem.bound
+        if bound.observation.label in robust_weights
+    ):
+        return 0.0
     name, evaluation = best.parameter.name, minimum.evaluation
     unknown = {_CHANGE: np.full(best.parameter.mean.size, np.inf)}
 
@@ -159,6 +170,12 @@ def fall_of_change(problem: Problem, minimum: Minimum) -> float:
     known = whole.square - minimum.information.covariance_of([whole.by_key])
     scores = Scores(places_of(unknown), whole.score, known, unknown[_CHANGE])
     return max(best.change.fall, scores.test([_CHANGE]).chi2)
+
+
+def _most_of_a_side(time: Array, weights: Array, at: ComponentChange) -> bool:
+    """Whether most measurements before a change, or after it, are gross errors."""
+    wrong, late = (weights == 0.0).reshape(time.size, -1).any(axis=1), time > at.change.time
+    return any(2 * np.count_nonzero(wrong[own]) > np.count_nonzero(own) for own in (late, ~late))
 
 
 def _most_probable(

@@ -248,7 +248,7 @@ class GrossErrors:
                 # What changed once would be a gross error ever after.
                 problem.robust_weights = {}
                 problem.weigh(evaluation)
-                price = fall_of_change(problem, at.minimum)
+                price = fall_of_change(problem, at.minimum, weights)
             for each in (changed, replace(changed, noise_factors=factors)):
                 yield Proposal(each, there.states, there.parameters, price=price)
 

@@ -107,9 +107,14 @@ def test_what_a_change_takes_off_is_what_it_added(clean):
     assert not slipped.problem.robust_weights
     added = 2.0 * (slipped.minimum.evaluation.cost - honest.minimum.evaluation.cost)
     assert added > 100.0
-    taken = fall_of_change(slipped.problem, slipped.minimum)
+    dvl = trial.dvl.time[:, None]
+    every = {"DVL velocity": (dvl < dvl.mean()).astype(float)}
+    taken = fall_of_change(slipped.problem, slipped.minimum, every)
     assert taken == pytest.approx(added, rel=0.1)
-    assert fall_of_change(honest.problem, honest.minimum) == 0.0
+    # It makes no single gross errors, and honest pings none at all.
+    few = {"DVL velocity": (np.arange(dvl.size) % 20 > 0).astype(float)}
+    assert fall_of_change(slipped.problem, slipped.minimum, few) == 0.0
+    assert fall_of_change(honest.problem, honest.minimum, every) == 0.0
 
 
 def test_one_beam_is_left_out_alone():
