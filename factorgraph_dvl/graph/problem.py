@@ -513,24 +513,44 @@ class Problem:
     def log_sigma(self, evaluation: Evaluation) -> list[Array]:
         """Return the sums of the logarithms of the standard deviations of measurements, (M,) each.
 
-        Costs of minima whose measurements weigh differently compare with these added. Zero where
-        a measurement cannot be used; where it is rejected, the cost of a gross error.
+        Those that measurements count by: where these follow a prediction, as a share of the speed,
+        they are not those of the evaluation. Costs of minima whose measurements weigh differently
+        compare with these added. Where a measurement is rejected, the cost of a gross error. Where
+        the chain does not cover it, as at the ends by another clock, what one costs on average, so
+        that problems with more measurements and with fewer compare.
         """
         out = []
-        for bound, motion, sigma in zip(
-            self._bound, evaluation.motions, self.sigma(evaluation), strict=True
-        ):
-            measured = np.isfinite(sigma)
-            logarithm = np.log(np.where(measured, sigma, 1.0))
+        sigma: list[Array] | None = None
+        for i, bound in enumerate(self._bound):
+            used = bound.weight > 0.0
+            logarithm = np.where(used, -np.log(np.where(used, bound.weight, 1.0)), 0.0)
             o = bound.observation
             left_out = np.isin(o.time, self.rejected.get(o.label, np.empty(0)))
             wrong = (self.robust_weights.get(o.label, np.ones(1)) == 0.0) | left_out[:, None]
             if wrong.any():
-                error = self.residual(o, motion, evaluation.parameters)
-                cost = gross_errors(np.where(measured, error, np.nan), sigma, wrong, o.unit)
+                sigma = sigma or self.sigma(evaluation)
+                measured = np.isfinite(sigma[i])
+                error = self.residual(o, evaluation.motions[i], evaluation.parameters)
+                cost = gross_errors(np.where(measured, error, np.nan), sigma[i], wrong, o.unit)
                 logarithm = np.where(wrong & measured, cost - 0.5 * np.log(2.0 * np.pi), logarithm)
-            out.append((bound.usable | left_out) * np.sum(logarithm, axis=1))
+            each = np.sum(logarithm, axis=1)
+            uncovered = ~(bound.usable | left_out)
+            if uncovered.any():
+                motion = evaluation.motions[i]
+                each[uncovered] = self._usual_cost(bound, motion, evaluation.parameters)
+            out.append(each)
         return out
+
+    def _usual_cost(
+        self, bound: BoundObservation, motion: Motion, parameters: Mapping[str, Array]
+    ) -> float:
+        """Return what a measurement costs on average by its noise as it is stated."""
+        used = bound.weight > 0.0
+        if not used.any():
+            return 0.0
+        values = bound.values(parameters, self.processes_of(bound))
+        stated = bound.observation.sigma(motion, values, 1.0)[used]
+        return float(np.sum(np.log(stated) + 0.5)) / np.count_nonzero(used.any(axis=1))
 
     def _weights(self, evaluation: Evaluation) -> list[Array]:
         """Return the weights that measurements have by their standard deviations there."""

@@ -124,31 +124,19 @@ def changes_at(
     return list(minimum.kept[_CHANGES])
 
 
-def fall_of_change(
-    problem: Problem, minimum: Minimum, robust_weights: Mapping[str, Array]
-) -> float:
-    """Return what the objective falls by, about, if a parameter changed once in place of errors.
+def fall_of_change(problem: Problem, minimum: Minimum) -> float:
+    """Return what the objective falls by, about, if a parameter changed once; 0 if none did.
 
-    That is 0 where none did, and where gross errors are not most of what is before or after it.
     Where it is a parameter of measurements, all else follows the change, states before and after
     it apart: what follows a parameter of the whole trial, as a heading, may follow no change.
 
     Parameters
     ----------
     problem, minimum : Problem or Minimum
-        Problem with all measurements, and its minimum.
-    robust_weights : mapping of str to ndarray
-        Weights of measurements, 0 of gross errors, by label.
+        Problem, and its minimum.
     """
-    found = [t for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
-    if not found:
-        return 0.0
-    best = max(found, key=lambda t: t.change.fall)
-    if not any(
-        _most_of_a_side(bound.observation.time, robust_weights[bound.observation.label], best)
-        for bound in problem.bound
-        if bound.observation.label in robust_weights
-    ):
+    best = _largest(problem, minimum)
+    if best is None:
         return 0.0
     name, evaluation = best.parameter.name, minimum.evaluation
     unknown = {_CHANGE: np.full(best.parameter.mean.size, np.inf)}
@@ -170,6 +158,29 @@ def fall_of_change(
     known = whole.square - minimum.information.covariance_of([whole.by_key])
     scores = Scores(places_of(unknown), whole.score, known, unknown[_CHANGE])
     return max(best.change.fall, scores.test([_CHANGE]).chi2)
+
+
+def _largest(problem: Problem, minimum: Minimum) -> ComponentChange | None:
+    """Return the change that explains most, None where there is none."""
+    found = [t for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
+    return max(found, key=lambda t: t.change.fall, default=None)
+
+
+def fall_without_errors(
+    problem: Problem, minimum: Minimum, robust_weights: Mapping[str, Array]
+) -> float:
+    """Return `fall_of_change` where gross errors are most of what is before or after the change.
+
+    Zero elsewhere. Arguments are the same, of a problem with all measurements, and
+    `robust_weights` are those of measurements, 0 of gross errors, by label.
+    """
+    best = _largest(problem, minimum)
+    instead = best is not None and any(
+        _most_of_a_side(bound.observation.time, robust_weights[bound.observation.label], best)
+        for bound in problem.bound
+        if bound.observation.label in robust_weights
+    )
+    return fall_of_change(problem, minimum) if instead else 0.0
 
 
 def _most_of_a_side(time: Array, weights: Array, at: ComponentChange) -> bool:

@@ -92,13 +92,16 @@ def _rough_minima(
 ) -> tuple[Problem, list[Minimum]]:
     """Return a problem, and its minima from all headings and mountings, the lowest first."""
     chain = prepared.chain(first.minimum.evaluation.states)
+    tilt = first.problem.tilt
+    if tilt is not None:
+        tilt = tilt.of(first.problem.parameters, [p for p in prepared.parameters if p.estimated])
     # A problem of their own: minimising weighs the measurements anew.
     problem = Problem(
         chain,
         prepared.observations,
         prepared.parameters,
         start=first.minimum.evaluation.parameters,
-        tilt=first.problem.tilt,
+        tilt=tilt,
     )
     problem.noise_factors = first.problem.noise_factors
     problem.noise_growth = first.problem.noise_growth

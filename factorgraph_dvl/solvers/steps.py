@@ -23,7 +23,12 @@ from factorgraph_dvl.sensors.parameters import Parameter
 from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at, fall_of_change
+from factorgraph_dvl.solvers.change_along_trial import (
+    CHANGED,
+    changes_at,
+    fall_of_change,
+    fall_without_errors,
+)
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
     noise_of,
@@ -206,11 +211,14 @@ class Averaging:
         if self._tested.before(model.parameters) or at.rough or at.problem.chain.interpolates:
             return
         self._tested.note(model.parameters)
-        for name, length in shown_windows(at.problem, at.minimum).items():
+        found = shown_windows(at.problem, at.minimum)
+        # A clock that jumps looks like a window where it turns.
+        price = fall_of_change(at.problem, at.minimum) if found else 0.0
+        for name, length in found.items():
             (freed,) = (wide(p, p.mean) for p in model.parameters if p.name == name)
             there = {**at.values, name: length}
             changed = replace(_with_others(at, freed), reference=(at.states, there))
-            yield Proposal(changed, at.states, there)
+            yield Proposal(changed, at.states, there, price=price)
 
 
 class GrossErrors:
@@ -248,7 +256,7 @@ class GrossErrors:
                 # What changed once would be a gross error ever after.
                 problem.robust_weights = {}
                 problem.weigh(evaluation)
-                price = fall_of_change(problem, at.minimum, weights)
+                price = fall_without_errors(problem, at.minimum, weights)
             for each in (changed, replace(changed, noise_factors=factors)):
                 yield Proposal(each, there.states, there.parameters, price=price)
 

@@ -390,6 +390,44 @@ def test_initial_priors_are_east_north_up_and_roll_pitch_heading():
         assert prior.error(values) == pytest.approx(0.5e-6, rel=1e-3)
 
 
+def test_problems_with_a_ping_more_and_less_compare():
+    """By another clock, the chain does not cover the last pings, of which each is no evidence."""
+    scene = scenario(manoeuvres=SHORT)
+    problem, values = problem_of(scene)
+    costs, counts = [], []
+    for offset in (0.0, -0.3):
+        start = problem.prior_values() | {"time_offset_s": np.array([offset])}
+        each = Problem(problem.chain, problem.observations, problem.all_parameters, start=start)
+        evaluation = each.evaluate(values)
+        each.weigh(evaluation)
+        (log_sigma,) = (
+            part
+            for part, o in zip(each.log_sigma(evaluation), each.observations, strict=True)
+            if o.label == "DVL velocity"
+        )
+        costs.append(log_sigma.sum())
+        counts.append(each.usable["DVL velocity"].sum())
+    fewer = counts[0] - counts[1]
+    assert fewer > 0
+    # Three velocities of about 1 cm/s each were worth 14 for each ping.
+    assert costs[1] - costs[0] == pytest.approx(1.5 * fewer, abs=0.1 * fewer)
+
+
+def test_costs_of_noise_are_those_that_measurements_count_by():
+    problem, values = problem_of(scenario(manoeuvres=SHORT))
+    problem.weigh(problem.evaluate(values))
+    faster = dict(zip(problem.usable, problem.weights, strict=True))
+    by_name = {p.name: p for p in problem.parameters}
+    moved = gtsam.Values(values)
+    moved.update(problem.key("scale_error"), by_name["scale_error"].mean + 0.1)
+    for label, log_sigma in zip(
+        problem.usable, problem.log_sigma(problem.evaluate(moved)), strict=True
+    ):
+        used = problem.usable[label]
+        expected = -np.log(faster[label][used]).sum(axis=1)
+        np.testing.assert_allclose(log_sigma[used], expected)
+
+
 def test_a_rejected_measurement_costs_a_gross_error_in_place_of_its_log_sigma():
     problem, values = problem_of(scenario(manoeuvres=SHORT))
     evaluation = problem.evaluate(values)

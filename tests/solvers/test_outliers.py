@@ -14,7 +14,7 @@ from factorgraph_dvl.analysis.error_statistics import calibration_errors
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import faults, simulate
 from factorgraph_dvl.solvers.batch import solve
-from factorgraph_dvl.solvers.change_along_trial import fall_of_change
+from factorgraph_dvl.solvers.change_along_trial import fall_of_change, fall_without_errors
 from factorgraph_dvl.solvers.preparation import prepare
 from factorgraph_dvl.solvers.rounds import settle
 
@@ -109,12 +109,13 @@ def test_what_a_change_takes_off_is_what_it_added(clean):
     assert added > 100.0
     dvl = trial.dvl.time[:, None]
     every = {"DVL velocity": (dvl < dvl.mean()).astype(float)}
-    taken = fall_of_change(slipped.problem, slipped.minimum, every)
+    taken = fall_of_change(slipped.problem, slipped.minimum)
     assert taken == pytest.approx(added, rel=0.1)
+    assert fall_without_errors(slipped.problem, slipped.minimum, every) == taken
     # It makes no single gross errors, and honest pings none at all.
     few = {"DVL velocity": (np.arange(dvl.size) % 20 > 0).astype(float)}
-    assert fall_of_change(slipped.problem, slipped.minimum, few) == 0.0
-    assert fall_of_change(honest.problem, honest.minimum, every) == 0.0
+    assert fall_without_errors(slipped.problem, slipped.minimum, few) == 0.0
+    assert fall_without_errors(honest.problem, honest.minimum, every) == 0.0
 
 
 def test_one_beam_is_left_out_alone():
