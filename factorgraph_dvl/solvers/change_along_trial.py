@@ -10,6 +10,7 @@ import numpy as np
 from factorgraph_dvl.estimates import Estimate
 from factorgraph_dvl.geometry.vectors import Array, IntArray
 from factorgraph_dvl.graph.bound_observation import BoundObservation
+from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Evaluation, Problem, Rows
 from factorgraph_dvl.message import Message, message
 from factorgraph_dvl.quality.finding import Code, Finding
@@ -125,39 +126,51 @@ def changes_at(
 
 
 def fall_of_change(problem: Problem, minimum: Minimum) -> float:
-    """Return what the objective falls by, about, if a parameter changed once; 0 if none did.
+    """Return what the objective falls by, about, if a parameter changed once; 0 if none did."""
+    best = _largest(problem, minimum)
+    if best is None:
+        return 0.0
+    return fall_where_free(problem, minimum.evaluation, minimum.information, best)
+
+
+def fall_where_free(
+    problem: Problem,
+    evaluation: Evaluation,
+    information: SquareRootInformation,
+    changed: ComponentChange,
+) -> float:
+    """Return what the objective falls by, about, if the parameter of a component changed then.
 
     Where it is a parameter of measurements, all else follows the change, states before and after
     it apart: what follows a parameter of the whole trial, as a heading, may follow no change.
 
     Parameters
     ----------
-    problem, minimum : Problem or Minimum
-        Problem, and its minimum.
+    problem, evaluation, information : Problem, Evaluation or SquareRootInformation
+        What was minimised, its minimum, and the information there.
+    changed : ComponentChange
+        Its component, and when.
     """
-    best = _largest(problem, minimum)
-    if best is None:
-        return 0.0
-    name, evaluation = best.parameter.name, minimum.evaluation
-    unknown = {_CHANGE: np.full(best.parameter.mean.size, np.inf)}
+    name = changed.parameter.name
+    unknown = {_CHANGE: np.full(changed.parameter.mean.size, np.inf)}
 
     def after(_: IntArray, part: BoundObservation, motion: Motion) -> dict[str, Array]:
         processes = problem.processes_of(part)
         lin = part.linearized(motion, evaluation.parameters, [name], processes)
-        late = part.observation.time > best.change.time
+        late = part.observation.time > changed.change.time
         return {_CHANGE: lin.d_parameters[name] * late[:, None, None]}
 
     sums = [
         record_sums_in_turn(problem, bound, evaluation, unknown, after)
         for bound in problem.bound
-        if name in bound.observation.parameters
+        if name in parameters_of(bound.observation)
     ]
     if not sums:
-        return best.change.fall
+        return changed.change.fall
     whole = in_all(sums)
-    known = whole.square - minimum.information.covariance_of([whole.by_key])
+    known = whole.square - information.covariance_of([whole.by_key])
     scores = Scores(places_of(unknown), whole.score, known, unknown[_CHANGE])
-    return max(best.change.fall, scores.test([_CHANGE]).chi2)
+    return max(changed.change.fall, scores.test([_CHANGE]).chi2)
 
 
 def _largest(problem: Problem, minimum: Minimum) -> ComponentChange | None:

@@ -22,7 +22,11 @@ from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl_distortion import FLEX_BY_TILT
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.parameters import UNITS, XYZ, Parameter
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, component_changes
+from factorgraph_dvl.solvers.change_along_trial import (
+    CHANGED,
+    component_changes,
+    fall_where_free,
+)
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
 from factorgraph_dvl.solvers.record_scores import record_scores
@@ -139,6 +143,11 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     more = test.chi2 - evidence(parameter, test) - float(np.log(problem.used_count))
     fall = test.chi2 * test.scatter - more
     if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
+        return None
+    largest = max(certain, key=lambda e: e.change.fall, default=None)
+    if largest is not None and fall < fall_where_free(
+        weighed.problem, weighed.evaluation, weighed.information, largest
+    ):
         return None
     others: tuple[str | Message, ...] = tuple(
         p.name

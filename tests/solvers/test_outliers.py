@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 from monte_carlo import RUNS
@@ -94,11 +95,16 @@ def test_a_mount_that_slips_makes_no_gross_errors(clean):
     assert not solution.rejected
 
 
-def test_what_a_change_takes_off_is_what_it_added(clean):
+@pytest.mark.parametrize(
+    "fault", [faults.dvl_slipped((0.0, 0.0, 0.3)), faults.clock_step("dvl", 0.02)]
+)
+def test_what_a_change_takes_off_is_what_it_added(clean, fault):
     """The test of a change, where all else follows it as that of a whole trial, finds less."""
+    settings = msgspec.structs.replace(clean.dvl.settings, time_offset_std_s=0.1)
+    timed = replace(clean, dvl=replace(clean.dvl, settings=settings))
     found = []
-    for degrees in (0.0, 0.3):
-        trial = faults.with_faults(clean, [faults.dvl_slipped((0.0, 0.0, degrees))])
+    for made in ([], [fault]):
+        trial = faults.with_faults(timed, made)
         prepared = prepare(trial, 1.0, lambda *_: None)
         states = prepared.start_positions.states[0]
         found.append(settle(prepared, states, lambda *_: None, roughly=True))
