@@ -81,6 +81,7 @@ def component_changes(
     chain, own = problem.chain, problem.chain.constants
     # Biases that walk, and what processes vary, change anyway.
     varying = {process.parameter for process in problem.processes}
+    varying |= {walk.parameter for p in problem.processes if (walk := p.free_walk) is not None}
     constant = {
         *(name for name in problem.columns if name not in varying),
         *(

@@ -358,7 +358,7 @@ class Uncorrelated:
         self._asked.note(*own)
         stated = {p.label for p in model.stated_processes}
         for process in model.processes:
-            if process.label not in stated and process.parameter is None:
+            if process.label not in stated:
                 left = tuple(p for p in model.processes if p is not process)
                 yield _from(at, processes=left)
 
