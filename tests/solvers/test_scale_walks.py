@@ -12,6 +12,7 @@ from truth import CONFIGS
 from factorgraph_dvl.quality.finding import Code
 from factorgraph_dvl.simulation import parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve, solve_with_problem
+from factorgraph_dvl.solvers.change_along_trial import changes_at
 from factorgraph_dvl.solvers.process_fit import refitted
 
 
@@ -31,6 +32,8 @@ def test_a_walk_that_is_not_stated_is_found():
     assert found.verdict.grade == "doubtful"
     (process,) = [p for p in solved.problem.processes if p.walk is not None]
     assert 0.5 < process.walk.rate * 60.0 / 0.02 < 2.0
+    # What walks changes anyway.
+    assert "scale_error" not in {t.name for t in changes_at(solved.problem, solved.minimum)}
     # Its rate is that of the largest likelihood: another estimate stays there.
     (again,) = [
         p for p in refitted(solved.problem, solved.minimum.evaluation) if p.walk is not None
