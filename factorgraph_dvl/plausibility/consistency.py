@@ -40,7 +40,13 @@ from factorgraph_dvl.plausibility.axes import (
 )
 from factorgraph_dvl.plausibility.clocks import LEAP_SECONDS, clock_findings, far_clock_finding
 from factorgraph_dvl.plausibility.dvl import mirrored_finding
-from factorgraph_dvl.plausibility.imu import HANDEDNESS, Candidate, diagnosis
+from factorgraph_dvl.plausibility.imu import (
+    CONTRADICTS,
+    HANDEDNESS,
+    UPRIGHT,
+    Candidate,
+    diagnosis,
+)
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.dvl import Dvl
 from factorgraph_dvl.sensors.gnss import Gnss
@@ -55,9 +61,8 @@ _TURNED = 30.0 * DEG
 # for the right one makes; the scatter of correlated receivers.
 _ARM_M = 0.3
 _ARM_SIGMAS = 12.0
-# Share of velocity changes that neither IMU nor noise explains, from which on axes are tried, and
-# clocks that are off by far. Chosen: what good trials leave, and what wrong ones do.
-_CONTRADICTS = 0.1
+# Share of velocity changes that neither IMU nor noise explains, from which on clocks that are off
+# by far are tried. Chosen: what wrong ones leave.
 _UNEXPLAINED = 0.3
 # Variance of what is left beside that of noise, from which on axes are tried as well. Chosen:
 # wrong axes make motion of their own, of which what they do not explain is a small share.
@@ -132,14 +137,14 @@ def consistency_findings(trial: Trial, errors: Sequence[Finding]) -> Iterator[Fi
         return [(comparison, around) for comparison, around in made if comparison is not None]
 
     views = _views(windows, sensors)
-    if max((view.excess for view in views), default=0.0) > _CONTRADICTS:
+    if max((view.excess for view in views), default=0.0) > CONTRADICTS:
         # What is grossly wrong for an instant says nothing of axes and clocks.
         sensors = [_without_gross_errors(s, views) for s in sensors]
         views = _views(windows, sensors)
     wrong: list[Candidate] = []
     suspected = any(f.code == Code.GYRO_UNIT for f in errors)
     suspected = suspected or any(view.beyond_noise > _BEYOND_NOISE for view in views)
-    if suspected or max((view.excess for view in views), default=0.0) > _CONTRADICTS:
+    if suspected or max((view.excess for view in views), default=0.0) > CONTRADICTS:
         down_b = frd_from_body(trial.body_axes)[2]
         wrong = diagnosis(compare, trial.inertial, -down_b)
     if wrong:
@@ -226,7 +231,7 @@ def _view(
         return None
     dvl = _without_outliers(dvl, around)
     right = _dvl_view(windows, sensor, replace(dvl, handedness=1), around)
-    if right.excess < _CONTRADICTS and right.off < _ALIASED_S:
+    if right.excess < CONTRADICTS and right.off < _ALIASED_S:
         return right
     mirrored = _dvl_view(windows, sensor, replace(dvl, handedness=-1), around)
     return mirrored if mirrored.believed_beside(right) else right
@@ -302,7 +307,7 @@ class _GnssView(_View[GnssWindows]):
 
     def findings(self) -> Iterator[Finding]:
         """Yield what is wrong with axes, clock and antenna."""
-        mistake = _gnss_mistake(self) if self.excess > _CONTRADICTS else None
+        mistake = _gnss_mistake(self) if self.excess > CONTRADICTS else None
         if mistake is not None:
             yield Finding(Code.GNSS_AXES, mistake, self.sensor.label, severity="error")
         elif self.clock is not None:
@@ -341,7 +346,7 @@ class _DvlView(_View[DvlWindows]):
             return False
         scale_error = self.compared.fit(self.late).scale_error
         ratio = self.clock.unexplained / max(right.clock.unexplained, 1e-12)
-        better = ratio < 1.0 / _MIRRORED and right.excess > _CONTRADICTS
+        better = ratio < 1.0 / _MIRRORED and right.excess > CONTRADICTS
         aliased = ratio < 1.0 and self.off < _ALIASED_S
         possible = abs(scale_error) < _LARGEST_SCALE_ERROR and self.excess < _UNEXPLAINED
         return possible and (better or aliased)
@@ -357,7 +362,7 @@ class _DvlView(_View[DvlWindows]):
 def _without_gross_errors(sensor: Gnss | Dvl, views: Sequence[_GnssView | _DvlView]) -> Gnss | Dvl:
     """Return a record without what stands out beside the carried IMU."""
     view = next((v for v in views if v.sensor is sensor), None)
-    if view is None or view.excess < _CONTRADICTS:
+    if view is None or view.excess < CONTRADICTS:
         return sensor
     compared: GnssWindows | DvlWindows = view.compared
     gross = np.zeros(compared.inside.shape, dtype=bool)
@@ -390,7 +395,7 @@ def _far(view: _GnssView | _DvlView) -> _GnssView | _DvlView:
     found = _view(view.windows, view.sensor, min(shares)[1])
     if found is None or found.clock is None or view.clock is None:
         return view
-    enough = found.excess < max(_FAR_LEFT * view.excess, _CONTRADICTS)
+    enough = found.excess < max(_FAR_LEFT * view.excess, CONTRADICTS)
     better = found.clock.unexplained < _FAR_LEFT_OF_ALL * view.clock.unexplained
     return found if enough and better else view
 
@@ -416,7 +421,7 @@ def _gnss_mistake(view: _GnssView) -> Message | None:
 
 def _course_findings(directions: BodyDirections, body_axes: BodyAxes) -> Iterator[Finding]:
     angle = off_course(directions, body_axes)
-    upright = -frd_from_body(body_axes)[2] @ directions.up > 0.7
+    upright = -frd_from_body(body_axes)[2] @ directions.up > UPRIGHT
     if angle is None or not upright or abs(angle) < _OFF_COURSE:
         return
     fit = [axes for axes in axes_that_fit(directions) if axes != body_axes]

@@ -314,6 +314,11 @@ Compare = Callable[[CarriedWindows], Sequence[tuple[Comparison, float]]]
 
 # Windows in which candidates are compared. Chosen: six minutes separate them.
 _COMPARED_WINDOWS = 9
+# Cosine of the angle between gravity and down up to which a body is upright. Chosen: 45°.
+UPRIGHT = 0.7
+# Share of velocity changes that neither IMU nor noise explains, from which on sensors contradict
+# the IMU. Chosen: what good trials leave.
+CONTRADICTS = 0.1
 # Share of what is unexplained that a candidate must leave at most, and its gain in log-likelihood.
 # Chosen: a right cause explains nearly all.
 _LEFT = 0.5
@@ -414,31 +419,37 @@ def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
     imu : Imu
         Record of the IMU.
     up_b : ndarray, shape (3,)
-        Up in body, by `body_axes`: gravity that is right already is not to be turned over.
+        Up in body, by `body_axes`: gravity that is right already is not to be turned.
     """
     nominal = _misfits(compare, imu, _FINE_S)
     if nominal is None or nominal.excess.max() == 0.0:
         return []
-    worst = int(np.argmax(nominal.excess))
     force = imu.accel.mean(axis=0)
-    upright = [c for c in candidates(imu) if up_b @ c.accel @ force >= min(up_b @ force, 0.0)]
-    found = _ranked(compare, imu, upright, worst, _COARSE_S)[:_TRIED]
-    found = _ranked(compare, imu, [candidate for *_, candidate in found], worst, _FINE_S)
+    least = min(float(up_b @ force), UPRIGHT * float(np.linalg.norm(force)))
+    upright = [c for c in candidates(imu) if up_b @ c.accel @ force >= least]
+    found = _ranked(compare, imu, upright, nominal, _COARSE_S)[:_TRIED]
+    found = _ranked(compare, imu, [candidate for *_, candidate in found], nominal, _FINE_S)
     if not found:
         return []
     least, left, _ = found[0]
-    if nominal.total - least < _GAIN or left > _LEFT * float(nominal.excess[worst]):
+    if nominal.total - least < _GAIN or left > _LEFT * float(nominal.excess.max()):
         return []
     return [candidate for total, _, candidate in found if total < least + _GAIN]
 
 
 def _ranked(
-    compare: Compare, imu: Imu, tried: Iterable[Candidate], worst: int, step: float
+    compare: Compare, imu: Imu, tried: Iterable[Candidate], nominal: _Misfits, step: float
 ) -> list[tuple[float, float, Candidate]]:
-    """Return misfit, and excess of the worst comparison, of candidates, the best first."""
+    """Return misfit, and excess of the worst comparison, of candidates, the best first.
+
+    Without those by which another sensor would contradict the IMU.
+    """
+    worst, most = int(np.argmax(nominal.excess)), np.maximum(nominal.excess, CONTRADICTS)
     found = []
     for candidate in tried:
         misfits = _misfits(compare, candidate.corrected(imu), step)
-        if misfits is not None and misfits.excess.size > worst:
+        if misfits is None or misfits.excess.size <= worst:
+            continue
+        if misfits.excess.size != most.size or np.all(misfits.excess <= most):
             found.append((misfits.total, float(misfits.excess[worst]), candidate))
     return sorted(found, key=lambda each: each[0])

@@ -12,7 +12,7 @@ from truth import CONFIGS, config, scenario
 
 from factorgraph_dvl.plausibility.survey import survey
 from factorgraph_dvl.quality.finding import Code
-from factorgraph_dvl.simulation import faults, parse_scenario, simulate
+from factorgraph_dvl.simulation import faults, instrument_faults, parse_scenario, simulate
 from factorgraph_dvl.solvers.batch import solve
 from factorgraph_dvl.trial import Trial
 
@@ -55,6 +55,19 @@ def found(trial: Trial, *changes: faults.Fault) -> dict[Code, str]:
 
 def test_a_right_trial_has_no_problems(trial: Trial) -> None:
     assert found(trial) == {}
+
+
+@pytest.mark.slow
+def test_a_dvl_that_takes_its_tilt_out_is_no_mistake_of_the_imu() -> None:
+    """Gyros in degrees would hardly turn, and axes y and z swapped would sway no DVL either."""
+    plan = yaml.safe_load((CONFIGS / "dive.yaml").read_text(encoding="utf-8"))
+    next(m for m in plan["manoeuvres"] if "repeat" in m)["repeat"] = 1
+    plan["gnss"]["outages_s"] = [[305, 1080]]
+    del plan["dvl"]["no_lock_s"]
+    plan["trial"] = {}
+    dive = simulate(parse_scenario(plan), 0)
+    levelled = faults.with_faults(dive, [instrument_faults.dvl_levelled()])
+    assert not [str(f) for f in survey(levelled).problems if f.severity == "error"]
 
 
 # In seed 11, slow turns and noise that persists looked like a jump of 0.7 s of the GNSS clock.
