@@ -194,6 +194,7 @@ def objective_again(problem: Problem, evaluation: Evaluation) -> float:
     again.robust_weights = problem.robust_weights
     for bound, weight in zip(again.bound, problem.weights, strict=True):
         bound.weight = weight
+    again.usual_costs = problem.usual_costs
     there = again.evaluate(evaluation.values)
     graph = again.linearize(there)
     last = [*problem.chain.constants, *(problem.key(p.name) for p in problem.parameters)]

@@ -154,6 +154,8 @@ class Problem:
         self.long_run: Mapping[str, Array] = {}
         self.gain = 0.0
         self.robust_weights: Mapping[str, Array] = {}
+        # What measurements that it does not cover cost where all were weighed, (M,) by label.
+        self.usual_costs: dict[str, Array] = {}
         self.bound_at = {**self.prior_values(), **(start or {})}
         # Where measurements were at the last evaluation, by their times.
         self._attachments: dict[Hashable, Any] = {}
@@ -410,6 +412,11 @@ class Problem:
         weights = self._weights(evaluation)
         for bound, weight in zip(self._bound, weights, strict=True):
             bound.weight = weight
+        self.usual_costs = {
+            bound.observation.label: self._usual_cost(i, evaluation)
+            for i, bound in enumerate(self._bound)
+            if not bound.usable.all()
+        }
         if not self.chain.interpolates:
             gradient = self._gradient_of_windows(evaluation, weights)
             sigma = [p.sigma for p in self.parameters]
@@ -516,8 +523,8 @@ class Problem:
         Those that measurements count by: where these follow a prediction, as a share of the speed,
         they are not those of the evaluation. Costs of minima whose measurements weigh differently
         compare with these added. Where a measurement is rejected, the cost of a gross error. Where
-        the chain does not cover it, as at the ends by another clock, what one costs on average, so
-        that problems with more measurements and with fewer compare.
+        the chain does not cover it, as at the ends by another clock, what it costs on average by
+        noise as stated, so that problems with more measurements and with fewer compare.
         """
         out = []
         sigma: list[Array] | None = None
@@ -534,23 +541,21 @@ class Problem:
                 cost = gross_errors(np.where(measured, error, np.nan), sigma[i], wrong, o.unit)
                 logarithm = np.where(wrong & measured, cost - 0.5 * np.log(2.0 * np.pi), logarithm)
             each = np.sum(logarithm, axis=1)
-            uncovered = ~(bound.usable | left_out)
+            uncovered = ~(bound.usable | wrong.any(axis=1))
             if uncovered.any():
-                motion = evaluation.motions[i]
-                each[uncovered] = self._usual_cost(bound, motion, evaluation.parameters)
+                usual = self.usual_costs.get(o.label)
+                each[uncovered] = (self._usual_cost(i, evaluation) if usual is None else usual)[
+                    uncovered
+                ]
             out.append(each)
         return out
 
-    def _usual_cost(
-        self, bound: BoundObservation, motion: Motion, parameters: Mapping[str, Array]
-    ) -> float:
-        """Return what a measurement costs on average by its noise as it is stated."""
-        used = bound.weight > 0.0
-        if not used.any():
-            return 0.0
-        values = bound.values(parameters, self.processes_of(bound))
-        stated = bound.observation.sigma(motion, values, 1.0)[used]
-        return float(np.sum(np.log(stated) + 0.5)) / np.count_nonzero(used.any(axis=1))
+    def _usual_cost(self, i: int, evaluation: Evaluation) -> Array:
+        """Return what measurements cost on average by noise as it is stated, (M,)."""
+        bound = self._bound[i]
+        values = bound.values(evaluation.parameters, self.processes_of(bound))
+        sigma = bound.observation.sigma(evaluation.motions[i], values, 1.0)
+        return np.sum(np.where(np.isfinite(sigma), np.log(sigma) + 0.5, 0.0), axis=1)
 
     def _weights(self, evaluation: Evaluation) -> list[Array]:
         """Return the weights that measurements have by their standard deviations there."""

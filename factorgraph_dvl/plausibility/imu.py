@@ -427,8 +427,12 @@ def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
     force = imu.accel.mean(axis=0)
     least = min(float(up_b @ force), UPRIGHT * float(np.linalg.norm(force)))
     upright = [c for c in candidates(imu) if up_b @ c.accel @ force >= least]
-    found = _ranked(compare, imu, upright, nominal, _COARSE_S)[:_TRIED]
-    found = _ranked(compare, imu, [candidate for *_, candidate in found], nominal, _FINE_S)
+    worst, anything = int(np.argmax(nominal.excess)), np.full(nominal.excess.size, np.inf)
+    found = _ranked(compare, imu, upright, worst, anything, _COARSE_S)[:_TRIED]
+    best = [candidate for *_, candidate in found]
+    # By a right candidate, no other sensor contradicts the IMU.
+    most = np.maximum(nominal.excess, CONTRADICTS)
+    found = _ranked(compare, imu, best, worst, most, _FINE_S)
     if not found:
         return []
     least, left, _ = found[0]
@@ -438,13 +442,17 @@ def diagnosis(compare: Compare, imu: Imu, up_b: Array) -> list[Candidate]:
 
 
 def _ranked(
-    compare: Compare, imu: Imu, tried: Iterable[Candidate], nominal: _Misfits, step: float
+    compare: Compare,
+    imu: Imu,
+    tried: Iterable[Candidate],
+    worst: int,
+    most: Array,
+    step: float,
 ) -> list[tuple[float, float, Candidate]]:
     """Return misfit, and excess of the worst comparison, of candidates, the best first.
 
-    Without those by which another sensor would contradict the IMU.
+    Those with more than the `most` that each comparison may leave are left out.
     """
-    worst, most = int(np.argmax(nominal.excess)), np.maximum(nominal.excess, CONTRADICTS)
     found = []
     for candidate in tried:
         misfits = _misfits(compare, candidate.corrected(imu), step)

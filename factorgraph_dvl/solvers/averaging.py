@@ -22,6 +22,7 @@ from factorgraph_dvl.solvers.known_parameters import evidence
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.model import Estimated
 from factorgraph_dvl.solvers.record_scores import (
+    averaged_noise,
     by_lengths,
     by_noise,
     part_of,
@@ -108,8 +109,8 @@ def _of_length(
     unknown = {_length(bound): np.full(lengths.size, np.inf)}
     derivatives = {_length(bound): means}
     scores = record_scores(problem, part, evaluation, information, unknown, motion, derivatives)
-    noise = by_noise(problem, bound, evaluation)[some].sum()
-    score, known = scores.score - noise * lengths**2, np.diag(scores.information)
+    noise = np.array([averaged_noise(problem, part, motion, evaluation, L) for L in lengths])
+    score, known = scores.score - 0.5 * noise, np.diag(scores.information)
     fall = 2.0 * score - known
     # That of a factor on each mean.
     shown = (score > 0.0) & (known > 0.0)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.estimates import Estimate
@@ -126,10 +127,14 @@ def changes_at(
     return list(minimum.kept[_CHANGES])
 
 
-def fall_of_change(problem: Problem, minimum: Minimum) -> float:
-    """Return what the objective falls by, about, if a parameter changed once; 0 if none did."""
+def fall_of_change(problem: Problem, minimum: Minimum, names: Container[str]) -> float:
+    """Return what the objective falls by, about, if one of some parameters changed once.
+
+    Zero where another one explains more by a change, or none does. Arguments are a problem, its
+    minimum, and the names of the parameters.
+    """
     best = _largest(problem, minimum)
-    if best is None:
+    if best is None or best.parameter.name not in names:
         return 0.0
     return fall_where_free(problem, minimum.evaluation, minimum.information, best)
 
@@ -139,39 +144,44 @@ def fall_where_free(
     evaluation: Evaluation,
     information: SquareRootInformation,
     changed: ComponentChange,
+    step: gtsam.VectorValues | None = None,
 ) -> float:
-    """Return what the objective falls by, about, if the parameter of a component changed then.
+    """Return what the objective falls by, about, if a component changed when it did.
 
-    Where it is a parameter of measurements, all else follows the change, states before and after
-    it apart: what follows a parameter of the whole trial, as a heading, may follow no change.
+    Where it is one of measurements, all else follows the change, states before and after it
+    apart: what follows a parameter of the whole trial, as a heading, may follow no change. Where
+    the objective has a gradient that no row has, the test of the change stands.
 
     Parameters
     ----------
     problem, evaluation, information : Problem, Evaluation or SquareRootInformation
-        What was minimised, its minimum, and the information there.
+        What was minimised, where it is, and the information there.
     changed : ComponentChange
-        Its component, and when.
+        The component, and when.
+    step : gtsam.VectorValues, optional
+        Step to the minimum, if it is not there.
     """
-    name = changed.parameter.name
-    unknown = {_CHANGE: np.full(changed.parameter.mean.size, np.inf)}
+    p = changed.parameter
+    own = p.component_names.index(changed.name)
+    records = [bound for bound in problem.bound if p.name in parameters_of(bound.observation)]
+    if not records or problem.tilt is not None:
+        return changed.change.fall
+    unknown = {_CHANGE: p.sigma[own : own + 1]}
 
     def after(_: IntArray, part: BoundObservation, motion: Motion) -> dict[str, Array]:
-        processes = problem.processes_of(part)
-        lin = part.linearized(motion, evaluation.parameters, [name], processes)
+        lin = part.linearized(motion, evaluation.parameters, [p.name], problem.processes_of(part))
         late = part.observation.time > changed.change.time
-        return {_CHANGE: lin.d_parameters[name] * late[:, None, None]}
+        return {_CHANGE: lin.d_parameters[p.name][:, :, own : own + 1] * late[:, None, None]}
 
-    sums = [
-        record_sums_in_turn(problem, bound, evaluation, unknown, after)
-        for bound in problem.bound
-        if name in parameters_of(bound.observation)
-    ]
-    if not sums:
-        return changed.change.fall
-    whole = in_all(sums)
+    whole = in_all(
+        [record_sums_in_turn(problem, each, evaluation, unknown, after) for each in records]
+    )
+    score = whole.score
+    if step is not None:
+        score = score - sum(rows @ step.at(key) for key, rows in whole.by_key.items())
     known = whole.square - information.covariance_of([whole.by_key])
-    scores = Scores(places_of(unknown), whole.score, known, unknown[_CHANGE])
-    return max(changed.change.fall, scores.test([_CHANGE]).chi2)
+    test = Scores(places_of(unknown), score, known, unknown[_CHANGE]).test([_CHANGE])
+    return max(changed.change.fall, test.chi2)
 
 
 def _largest(problem: Problem, minimum: Minimum) -> ComponentChange | None:
@@ -185,22 +195,28 @@ def fall_without_errors(
 ) -> float:
     """Return `fall_of_change` where gross errors are most of what is before or after the change.
 
-    Zero elsewhere. Arguments are the same, of a problem with all measurements, and
-    `robust_weights` are those of measurements, 0 of gross errors, by label.
+    Zero elsewhere. Arguments are a problem with all measurements, its minimum, and the weights of
+    measurements by label, 0 of gross errors.
     """
     best = _largest(problem, minimum)
-    instead = best is not None and any(
-        _most_of_a_side(bound.observation.time, robust_weights[bound.observation.label], best)
+    if best is None:
+        return 0.0
+    names = {
+        name
         for bound in problem.bound
         if bound.observation.label in robust_weights
-    )
-    return fall_of_change(problem, minimum) if instead else 0.0
+        and _most_of_a_side(bound, robust_weights[bound.observation.label], best.change.time)
+        for name in parameters_of(bound.observation)
+    }
+    return fall_of_change(problem, minimum, names)
 
 
-def _most_of_a_side(time: Array, weights: Array, at: ComponentChange) -> bool:
+def _most_of_a_side(bound: BoundObservation, weights: Array, change: float) -> bool:
     """Whether most measurements before a change, or after it, are gross errors."""
-    wrong, late = (weights == 0.0).reshape(time.size, -1).any(axis=1), time > at.change.time
-    return any(2 * np.count_nonzero(wrong[own]) > np.count_nonzero(own) for own in (late, ~late))
+    time, used = bound.observation.time, bound.usable
+    wrong, late = (weights == 0.0).reshape(time.size, -1).any(axis=1), time > change
+    sides = (late & used, ~late & used)
+    return any(2 * np.count_nonzero(wrong[own]) > np.count_nonzero(own) for own in sides)
 
 
 def _most_probable(

@@ -85,6 +85,8 @@ class Explanation:
     others : tuple of str or Message
         Names of those that explain the misfit about as well, `imu.sampling` where that does, and
         changes along the trial that do.
+    tried : int
+        Number of parameters of which it is the most probable.
     shape : Shape, optional
         What a search found of it: the period of a sawtooth, or the span of water.
     """
@@ -92,6 +94,7 @@ class Explanation:
     parameter: Parameter
     score: Score
     others: tuple[str | Message, ...]
+    tried: int
     shape: Shape | None = None
 
     @property
@@ -102,8 +105,8 @@ class Explanation:
 
     @property
     def price(self) -> float:
-        """What the objective must fall by if it is estimated."""
-        return 0.0 if self.shape is None else self.shape.price
+        """What the objective must fall by if it is estimated: each of these may by chance."""
+        return 2.0 * float(np.log(self.tried)) + (0.0 if self.shape is None else self.shape.price)
 
 
 def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanation | None:
@@ -126,8 +129,8 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     weighed = _weighed(problem, minimum)
     shapes = _shapes(problem, minimum)
     tests = _tests(problem, minimum, weighed, shapes)
-    asked = sum(p.spec.plausible is not None for p in problem.all_parameters)
-    shared = np.log10(max(asked, 1))
+    tried = max(sum(p.spec.plausible is not None for p in problem.all_parameters), 1)
+    shared = np.log10(tried)
     significant = [
         (p, test)
         for p, test in tests.values()
@@ -146,7 +149,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
         return None
     largest = max(certain, key=lambda e: e.change.fall, default=None)
     if largest is not None and fall < fall_where_free(
-        weighed.problem, weighed.evaluation, weighed.information, largest
+        weighed.problem, weighed.evaluation, weighed.information, largest, weighed.step
     ):
         return None
     others: tuple[str | Message, ...] = tuple(
@@ -161,7 +164,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):
         others = (*others, "imu.sampling")
-    return Explanation(parameter, test, others, shapes.get(parameter.name))
+    return Explanation(parameter, test, others, tried, shapes.get(parameter.name))
 
 
 def _shapes(problem: Problem, minimum: Minimum) -> Shapes:

@@ -73,11 +73,10 @@ def competing_minima(
         return [first]
     report("other mountings", 0, None)
     out = [first]
-    rough, rough_minima = _rough_minima(prepared, first, states)
-    for each in rough_minima:
+    for against, each in _rough_minima(prepared, first, states):
         found = each.evaluation
         best = min(_against(m.problem, m.minimum.evaluation) for m in out)
-        if _against(rough, found) > best + _ROUGHLY_AS_GOOD:
+        if against > best + _ROUGHLY_AS_GOOD:
             break
         if _is_among(out, found, rotations):
             continue
@@ -89,8 +88,8 @@ def competing_minima(
 
 def _rough_minima(
     prepared: Preparation, first: SettledMinimum, states: States
-) -> tuple[Problem, list[Minimum]]:
-    """Return a problem, and its minima from all headings and mountings, the lowest first."""
+) -> list[tuple[float, Minimum]]:
+    """Return minima from all headings and mountings, lowest first, with what is against each."""
     chain = prepared.chain(first.minimum.evaluation.states)
     tilt = first.problem.tilt
     if tilt is not None:
@@ -121,8 +120,9 @@ def _rough_minima(
             }
             at = problem.values(turned, problem.prior_values() | values)
             starts.append((problem.evaluate(at).cost, at))
-    rough = [
-        minimise(
+    rough = []
+    for _, at in sorted(starts, key=lambda s: s[0])[:_STARTS]:
+        found = minimise(
             problem,
             at,
             stage="other mountings",
@@ -130,9 +130,9 @@ def _rough_minima(
             tolerance=ROUGH_TOLERANCE,
             proven=False,
         )
-        for _, at in sorted(starts, key=lambda s: s[0])[:_STARTS]
-    ]
-    return problem, sorted(rough, key=lambda m: m.evaluation.cost)
+        # The next one weighs the measurements anew.
+        rough.append((_against(problem, found.evaluation), found))
+    return sorted(rough, key=lambda each: each[1].evaluation.cost)
 
 
 def _is_among(

@@ -325,3 +325,21 @@ def by_noise(problem: Problem, bound: BoundObservation, evaluation: Evaluation) 
         return np.zeros(bound.observation.time.size)
     score = np.where(bound.weight > 0.0, bound.weight**2 * bend, 0.0)
     return np.asarray(np.sum(score, axis=1)) / (24.0 * _BETWEEN**2)
+
+
+def averaged_noise(
+    problem: Problem,
+    bound: BoundObservation,
+    motion: Motion,
+    evaluation: Evaluation,
+    length: float,
+) -> float:
+    """Return what squares of residuals fall by, on average, as a mean averages noise of the IMU.
+
+    Whatever the sensor does. Arguments are those of `by_lengths`.
+    """
+    lin = bound.by_motion(motion, evaluation.parameters, problem.processes_of(bound))
+    saved = bound.chain.averaged(bound.attachment, lin, length)
+    if saved is None:
+        return 0.0
+    return float(np.sum(np.where(bound.weight > 0.0, bound.weight**2 * saved, 0.0)))

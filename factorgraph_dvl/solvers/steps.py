@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from factorgraph_dvl.geometry.vectors import Array
+from factorgraph_dvl.graph.clocks import parameters_of
 from factorgraph_dvl.graph.problem import Problem
 from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.graph.smooth_chain import SmoothChain
@@ -207,14 +208,20 @@ class Averaging:
 
     def proposals(self, at: Estimated) -> Iterator[Proposal]:
         """Yield what estimates the length of a window, where the data show one."""
-        model = at.model
-        if self._tested.before(model.parameters) or at.rough or at.problem.chain.interpolates:
+        model, problem = at.model, at.problem
+        own = model.parameters, model.prepared, _labels(model.processes)
+        if self._tested.before(*own) or at.rough or problem.chain.interpolates:
             return
-        self._tested.note(model.parameters)
-        found = shown_windows(at.problem, at.minimum)
-        # A clock that jumps looks like a window where it turns.
-        price = fall_of_change(at.problem, at.minimum) if found else 0.0
-        for name, length in found.items():
+        self._tested.note(*own)
+        for name, length in shown_windows(problem, at.minimum).items():
+            # A clock that jumps looks like a window where it turns.
+            others = {
+                other
+                for o in problem.observations
+                if name in parameters_of(o)
+                for other in parameters_of(o)
+            }
+            price = fall_of_change(problem, at.minimum, others)
             (freed,) = (wide(p, p.mean) for p in model.parameters if p.name == name)
             there = {**at.values, name: length}
             changed = replace(_with_others(at, freed), reference=(at.states, there))

@@ -115,7 +115,8 @@ def test_what_a_change_takes_off_is_what_it_added(clean, fault):
     assert added > 100.0
     dvl = trial.dvl.time[:, None]
     every = {"DVL velocity": (dvl < dvl.mean()).astype(float)}
-    taken = fall_of_change(slipped.problem, slipped.minimum)
+    names = {"misalignment_deg", "time_offset_s"}
+    taken = fall_of_change(slipped.problem, slipped.minimum, names)
     assert taken == pytest.approx(added, rel=0.1)
     assert fall_without_errors(slipped.problem, slipped.minimum, every) == taken
     # It makes no single gross errors, and honest pings none at all.
