@@ -79,7 +79,7 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
         shown = scatter * float(ndtri(1.0 - _BY_CHANCE / usual)) ** 2
         length, certain = _length(bound), False
         if length in own and tests[length].step[0] > 0.0 and tests[length].chi2 > shown:
-            tests[length], certain = _of_length(problem, bound, minimum, tests[length])
+            tests[length], certain = _of_length(problem, bound, minimum, tests[length], scatter)
         # A clock and a delay beside it do the same to a record: the clock is what is stated.
         cause = max(own, key=lambda name: (tests[name].chi2, known[name].spec.usual))
         cause = length if certain else cause
@@ -94,11 +94,16 @@ def shown_windows(problem: Problem, minimum: Minimum) -> dict[str, Array]:
 
 
 def _of_length(
-    problem: Problem, bound: BoundObservation, minimum: Minimum, test: Score
+    problem: Problem,
+    bound: BoundObservation,
+    minimum: Minimum,
+    test: Score,
+    scatter: float,
 ) -> tuple[Score, bool]:
     """Return the test of a length, s, by that of its square, and whether no other fits as well.
 
-    Means over lengths of the same order that fit better than the square says take its place.
+    Means over lengths of the same order that fit better than the square says take its place. The
+    scatter is the variance of residuals over that of stated noise.
     """
     length = np.sqrt(test.step)
     found = replace(test, step=length, std=test.std / (2.0 * length))
@@ -116,7 +121,9 @@ def _of_length(
     shown = (score > 0.0) & (known > 0.0)
     most = np.divide(score**2, known, out=np.zeros_like(score), where=shown)
     best = int(np.argmax(fall))
-    certain = most[0] < _SHAPE * fall[best] and fall[best] > _SHAPE * np.max(most)
+    # The data show the square of a window: its relative error is twice that of the length.
+    least = max((1.0 - _SHAPE) * fall[best], (2.0 * _CERTAIN) ** 2 * scatter)
+    certain = fall[best] - most[0] > least and fall[best] > _SHAPE * np.max(most)
     if fall[best] > test.chi2:
         found = replace(found, chi2=float(fall[best]), step=lengths[best : best + 1])
     return found, bool(certain)
