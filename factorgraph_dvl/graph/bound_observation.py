@@ -202,6 +202,25 @@ class BoundObservation:
         self._sees_motion = missing is not None
         return missing
 
+    def averaged_noise(self, at: Any, lin: Linearization, length: float, weight: Array) -> float:
+        """Return by how much squares of residuals fall, on average, as a mean averages IMU noise.
+
+        Parameters
+        ----------
+        at : object
+            Where measurements are attached to the chain.
+        lin : Linearization
+            Their derivatives by the motion there.
+        length : float, s
+            Length of the window.
+        weight : ndarray, shape (M, d)
+            What they are weighed by; 0 = not used.
+        """
+        saved = self.chain.averaged(at, lin, length)
+        if saved is None:
+            return 0.0
+        return float(np.sum(np.where(weight > 0.0, weight**2 * saved, 0.0)))
+
     def by_motion(
         self, motion: Motion, parameters: Mapping[str, Array], processes: Processes
     ) -> Linearization:

@@ -440,14 +440,12 @@ class Problem:
             size = abs(float(evaluation.parameters[name][0]))
             length = max(size, SHORTEST)
             lin = bound.by_motion(motion, evaluation.parameters, self.processes_of(bound))
-            saved = self.chain.averaged(at, lin, length)
-            if saved is not None:
-                used = np.where(weight > 0.0, weight**2 * saved, 0.0)
-                # Below that, what a window does goes by the square x² of its length: it takes
-                # (6 x² - 2 x⁴) / 24 of it, as its covariance with what it averages is 1/8 of it.
-                short = size / length
-                share = 1.5 * short - 0.5 * short**3
-                gradient[self.columns[name]] += 0.5 * share * float(np.sum(used)) / length
+            saved = bound.averaged_noise(at, lin, length, weight)
+            # Below that, what a window does goes by the square x² of its length: it takes
+            # (6 x² - 2 x⁴) / 24 of it, as its covariance with what it averages is 1/8 of it.
+            short = size / length
+            share = 1.5 * short - 0.5 * short**3
+            gradient[self.columns[name]] += 0.5 * share * saved / length
         return gradient
 
     def weighed(self, evaluation: Evaluation) -> Evaluation:
@@ -544,9 +542,8 @@ class Problem:
             uncovered = ~(bound.usable | wrong.any(axis=1))
             if uncovered.any():
                 usual = self.usual_costs.get(o.label)
-                each[uncovered] = (self._usual_cost(i, evaluation) if usual is None else usual)[
-                    uncovered
-                ]
+                usual = self._usual_cost(i, evaluation) if usual is None else usual
+                each[uncovered] = usual[uncovered]
             out.append(each)
         return out
 

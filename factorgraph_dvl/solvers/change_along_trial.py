@@ -22,10 +22,9 @@ from factorgraph_dvl.sensors.protocol import Motion
 from factorgraph_dvl.solvers.calibration import reported
 from factorgraph_dvl.solvers.fixed_directions import SolvedProblem
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
-from factorgraph_dvl.solvers.record_scores import in_all, record_sums_in_turn
+from factorgraph_dvl.solvers.record_scores import in_all, record_sums_in_turn, scores_of
 from factorgraph_dvl.statistics.constancy import Change, changes
 from factorgraph_dvl.statistics.rows import rows_by_source, rows_with_times
-from factorgraph_dvl.statistics.scores import Scores, places_of
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
 # Standard deviations from which on a change is one. Chosen: the probability by chance is below
@@ -127,13 +126,23 @@ def changes_at(
     return list(minimum.kept[_CHANGES])
 
 
+def certain(changes: Iterable[ComponentChange]) -> list[ComponentChange]:
+    """Return the changes that are no chance."""
+    return [each for each in changes if each.change.chi2 > CHANGED**2]
+
+
+def largest(changes: Iterable[ComponentChange]) -> ComponentChange | None:
+    """Return the change that explains most, None where there is none."""
+    return max(changes, key=lambda each: each.change.fall, default=None)
+
+
 def fall_of_change(problem: Problem, minimum: Minimum, names: Container[str]) -> float:
     """Return what the objective falls by, about, if one of some parameters changed once.
 
     Zero where another one explains more by a change, or none does. Arguments are a problem, its
     minimum, and the names of the parameters.
     """
-    best = _largest(problem, minimum)
+    best = largest(certain(changes_at(problem, minimum)))
     if best is None or best.parameter.name not in names:
         return 0.0
     return fall_where_free(problem, minimum.evaluation, minimum.information, best)
@@ -176,18 +185,8 @@ def fall_where_free(
     whole = in_all(
         [record_sums_in_turn(problem, each, evaluation, unknown, after) for each in records]
     )
-    score = whole.score
-    if step is not None:
-        score = score - sum(rows @ step.at(key) for key, rows in whole.by_key.items())
-    known = whole.square - information.covariance_of([whole.by_key])
-    test = Scores(places_of(unknown), score, known, unknown[_CHANGE]).test([_CHANGE])
+    test = scores_of(whole, information, unknown, step).test([_CHANGE])
     return max(changed.change.fall, test.chi2)
-
-
-def _largest(problem: Problem, minimum: Minimum) -> ComponentChange | None:
-    """Return the change that explains most, None where there is none."""
-    found = [t for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
-    return max(found, key=lambda t: t.change.fall, default=None)
 
 
 def fall_without_errors(
@@ -198,7 +197,7 @@ def fall_without_errors(
     Zero elsewhere. Arguments are a problem with all measurements, its minimum, and the weights of
     measurements by label, 0 of gross errors.
     """
-    best = _largest(problem, minimum)
+    best = largest(certain(changes_at(problem, minimum)))
     if best is None:
         return 0.0
     names = {
@@ -232,8 +231,8 @@ def _most_probable(
     ]
     if not significant:
         return None
-    largest = max(t.change.fall for t in significant)
-    ties = [t for t in significant if largest - t.change.fall < 2.0 * _TIE]
+    most = max(t.change.fall for t in significant)
+    ties = [t for t in significant if most - t.change.fall < 2.0 * _TIE]
     # Of what is about as probable, what the trial is for.
     best = min(ties, key=lambda t: (t.parameter.spec.nuisance, -t.change.fall))
     return best, [t for t in ties if t is not best]
@@ -297,11 +296,11 @@ def change_findings(
     limits : mapping of str to float
         Standard deviations that are good enough, by parameter, in reported units.
     """
-    found_change = _most_probable(changes_at(found.problem, found.minimum, every), estimates)
-    if found_change is None:
+    tests = changes_at(found.problem, found.minimum, every)
+    most_probable = _most_probable(tests, estimates)
+    if most_probable is None:
         return
-    tests = changes_at(found.problem, found.minimum)
-    best, ties = found_change
+    best, ties = most_probable
     change = best.change
     unit = UNITS[best.parameter.spec.unit].text
     others: Message | str = ""

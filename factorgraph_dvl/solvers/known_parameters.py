@@ -23,9 +23,10 @@ from factorgraph_dvl.sensors.dvl_distortion import FLEX_BY_TILT
 from factorgraph_dvl.sensors.imu import ERRORS, GYRO_SCALE, Imu
 from factorgraph_dvl.sensors.parameters import UNITS, XYZ, Parameter
 from factorgraph_dvl.solvers.change_along_trial import (
-    CHANGED,
+    certain,
     component_changes,
     fall_where_free,
+    largest,
 )
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum, factorized
 from factorgraph_dvl.solvers.parameter_scores import ParameterScores, parameter_scores
@@ -139,17 +140,17 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     if not significant:
         return None
     changes = component_changes(weighed.problem, weighed.evaluation, weighed.information)
-    certain = [e for e in changes if e.change.chi2 > CHANGED**2]
+    changed = certain(changes)
     significant.sort(key=lambda each: -evidence(*each))
     parameter, test = significant[0]
     # A change costs as one component does of what there are as many of as measurements.
     more = test.chi2 - evidence(parameter, test) - float(np.log(problem.used_count))
     fall = test.chi2 * test.scatter - more
-    if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in certain):
+    if any(e.change.chi2 > test.chi2 - more or e.change.fall > fall for e in changed):
         return None
-    largest = max(certain, key=lambda e: e.change.fall, default=None)
-    if largest is not None and fall < fall_where_free(
-        weighed.problem, weighed.evaluation, weighed.information, largest, weighed.step
+    most = largest(changed)
+    if most is not None and fall < fall_where_free(
+        weighed.problem, weighed.evaluation, weighed.information, most, weighed.step
     ):
         return None
     others: tuple[str | Message, ...] = tuple(
@@ -159,7 +160,7 @@ def explanation(problem: Problem, minimum: Minimum, imu: Imu | None) -> Explanat
     )
     others += tuple(
         message("unexplained_misfit.change", name=e.name, time=e.change.time)
-        for e in certain
+        for e in changed
         if fall - e.change.fall < 2.0 * _TIE
     )
     if imu is not None and parameter.name == GYRO_SCALE and _is_sampling(test, imu):

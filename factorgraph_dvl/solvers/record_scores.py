@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+import gtsam
 import numpy as np
 
 from factorgraph_dvl.geometry.records import rows_of
@@ -92,9 +93,34 @@ def record_scores(
         Derivatives (M, d, n) by some of the parameters, in place of those of the observation.
     """
     sums = record_sums(problem, bound, evaluation, candidates, motion, derivatives)
+    return scores_of(sums, information, candidates)
+
+
+def scores_of(
+    sums: RecordSums,
+    information: SquareRootInformation,
+    candidates: Mapping[str, Array],
+    step: gtsam.VectorValues | None = None,
+) -> Scores:
+    """Return the scores of parameters whose sums are known.
+
+    Parameters
+    ----------
+    sums : RecordSums
+        Sums over all rows that depend on them.
+    information : SquareRootInformation
+        Information on all variables.
+    candidates : mapping of str to ndarray
+        Standard deviations (n,) of the wide prior of each, SI; they may be infinite.
+    step : gtsam.VectorValues, optional
+        Step to the minimum, if the sums are of elsewhere.
+    """
+    score = sums.score
+    if step is not None:
+        score = score - sum(rows @ step.at(key) for key, rows in sums.by_key.items())
     square = sums.square - information.covariance_of([sums.by_key])
     wide = np.concatenate(list(candidates.values()))
-    return Scores(places_of(candidates), sums.score, square, wide)
+    return Scores(places_of(candidates), score, square, wide)
 
 
 def record_sums(
@@ -325,21 +351,3 @@ def by_noise(problem: Problem, bound: BoundObservation, evaluation: Evaluation) 
         return np.zeros(bound.observation.time.size)
     score = np.where(bound.weight > 0.0, bound.weight**2 * bend, 0.0)
     return np.asarray(np.sum(score, axis=1)) / (24.0 * _BETWEEN**2)
-
-
-def averaged_noise(
-    problem: Problem,
-    bound: BoundObservation,
-    motion: Motion,
-    evaluation: Evaluation,
-    length: float,
-) -> float:
-    """Return what squares of residuals fall by, on average, as a mean averages noise of the IMU.
-
-    Whatever the sensor does. Arguments are those of `by_lengths`.
-    """
-    lin = bound.by_motion(motion, evaluation.parameters, problem.processes_of(bound))
-    saved = bound.chain.averaged(bound.attachment, lin, length)
-    if saved is None:
-        return 0.0
-    return float(np.sum(np.where(bound.weight > 0.0, bound.weight**2 * saved, 0.0)))

@@ -14,7 +14,7 @@ from factorgraph_dvl.graph.processes import Process
 from factorgraph_dvl.message import message
 from factorgraph_dvl.quality.finding import Code, Finding
 from factorgraph_dvl.sensors.protocol import ScaleWalk
-from factorgraph_dvl.solvers.change_along_trial import CHANGED, changes_at
+from factorgraph_dvl.solvers.change_along_trial import certain, changes_at, largest
 from factorgraph_dvl.solvers.correlated_noise import walking_alone
 from factorgraph_dvl.solvers.levenberg_marquardt import Minimum
 from factorgraph_dvl.solvers.model import Estimated
@@ -61,10 +61,9 @@ def instead_of_a_change(problem: Problem, minimum: Minimum) -> Iterator[tuple[Pr
         Problem, and its minimum.
     """
     changes = changes_at(problem, minimum)
-    changed = [c for c in changes if c.change.chi2 > CHANGED**2]
-    if not changed:
+    most = largest(certain(changes))
+    if most is None:
         return
-    most = max(changed, key=lambda c: c.change.fall)
     taken = {p.label for p in problem.processes}
     index = max((p.index for p in problem.processes), default=-1) + 1
     for i, walk in _walks(problem):

@@ -25,10 +25,11 @@ from factorgraph_dvl.solution import Progress
 from factorgraph_dvl.solvers.averaging import shown_windows
 from factorgraph_dvl.solvers.bias_walks import bias_walks
 from factorgraph_dvl.solvers.change_along_trial import (
-    CHANGED,
+    certain,
     changes_at,
     fall_of_change,
     fall_without_errors,
+    largest,
 )
 from factorgraph_dvl.solvers.correlated_noise import (
     correlated_noise,
@@ -720,11 +721,13 @@ def _between(before: Process, after: Process, share: float) -> Process:
 
 def _changes_explain_more(problem: Problem, minimum: Minimum, gain: float) -> bool:
     """Whether a parameter that changed along the trial explains more than correlated noise."""
-    found = [t.change for t in changes_at(problem, minimum) if t.change.chi2 > CHANGED**2]
-    if not found:
+    found = certain(changes_at(problem, minimum))
+    most = largest(found)
+    if most is None:
         return False
-    most = max(found, key=lambda c: c.fall)
-    return max(c.chi2 for c in found) > gain or gain < most.fall < _MOST_SCATTER * most.chi2
+    change = most.change
+    explains = gain < change.fall < _MOST_SCATTER * change.chi2
+    return explains or max(t.change.chi2 for t in found) > gain
 
 
 def _biases_explain_more(at: Estimated) -> bool:
@@ -733,8 +736,7 @@ def _biases_explain_more(at: Estimated) -> bool:
     misfit = 2.0 * evaluation.cost - count
     if not (at.minimum.converged and misfit > _LARGE_MISFIT * count):
         return False
-    found = changes_at(at.problem, at.minimum)
-    most = max(found, key=lambda t: t.change.fall, default=None)
+    most = largest(changes_at(at.problem, at.minimum))
     if most is None or most.parameter.name not in BIASES:
         return False
     return most.change.fall > _SHARE_OF_MISFIT * misfit

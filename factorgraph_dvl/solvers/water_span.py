@@ -21,7 +21,12 @@ from factorgraph_dvl.graph.bound_observation import BoundObservation
 from factorgraph_dvl.graph.problem import Evaluation, Problem
 from factorgraph_dvl.sensors.dvl_water import CURRENT, WATER, WATER_SPAN
 from factorgraph_dvl.sensors.protocol import Motion
-from factorgraph_dvl.solvers.record_scores import part_of, record_sums_in_turn, unexplained
+from factorgraph_dvl.solvers.record_scores import (
+    part_of,
+    record_sums_in_turn,
+    scores_of,
+    unexplained,
+)
 from factorgraph_dvl.solvers.shape import Shape
 from factorgraph_dvl.statistics.square_root_information import SquareRootInformation
 
@@ -121,8 +126,8 @@ def _by_block(
 
     unknown = {WATER: np.full(2 * count, np.inf)}
     sums = record_sums_in_turn(problem, bound, evaluation, unknown, by_blocks)
-    known = sums.square - information.covariance_of([sums.by_key])
-    return sums.score.reshape(count, 2), known.reshape(count, 2, count, 2)
+    found = scores_of(sums, information, unknown)
+    return found.score.reshape(count, 2), found.information.reshape(count, 2, count, 2)
 
 
 def _elsewhere(score: Array, information: Array, inside: BoolArray) -> float:
